@@ -1,0 +1,272 @@
+"""The verbs every vecenv environment speaks, and the values that travel through them.
+
+Read this page first. An environment is a *batch* of ``B = num_envs`` slots; each slot holds one episode of one task.
+``reset`` makes every slot live and returns metadata, ``step_*`` advances and returns control signals, ``observe_*``
+reads without advancing, ``evaluate`` reports the verdict. All arrays are NumPy, the first axis is the slot, lengths are
+metres, angles radians, poses are in the world frame, quaternions are wxyz.
+
+Rules that hold for every environment:
+
+* ``reset`` is an idempotent ensure-live: live slots are left alone, finished ones are re-armed in place. Which episode
+  sits in a slot is decided by ``set_episodes``, never by ``reset``.
+* ``observe_*`` never advances a slot; on a finished slot it reads the terminal state.
+* ``terminated`` means success, ``truncated`` means the step budget ran out (or the slot was quarantined). A finished
+  slot ignores further steps: reward 0, flags kept.
+* A chunk of K actions stops at a slot's own terminal step; the other slots go on.
+* NaN and infinities in actions become 0 and values are clipped to the action range; ``info["mended"]`` says where.
+* A slot whose physics fails (non-finite state, exhausted contact memory) is quarantined: ``info["fault"][i]`` names the
+  cause, the slot ends truncated and unsuccessful, and no other slot is affected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+# Columns of the 7-vector taken by ``step_continuous``.
+ACTION_DIM = 7
+# Columns of the 8-vector taken by ``step_ee_pose``: x, y, z, qw, qx, qy, qz, grip (1 closed, 0 open).
+EE_POSE_DIM = 8
+
+
+@dataclass(frozen=True)
+class ResetInfo:
+    """What ``reset`` returns: episode metadata, no observation.
+
+    Attributes:
+        instruction: language instruction of each slot, length B.
+        episode_id: ``"{suite}/{task}/{episode}"`` of each slot, length B.
+        suite: suite name of the environment.
+        task_id: task index of each slot, int [B].
+        max_steps: step budget of each slot in control ticks, int [B].
+    """
+
+    instruction: tuple[str, ...]
+    episode_id: tuple[str, ...]
+    suite: str
+    task_id: np.ndarray
+    max_steps: np.ndarray
+
+
+@dataclass(frozen=True)
+class Control:
+    """What every ``step_*`` returns: control signals, no observation.
+
+    Attributes:
+        reward: sum of the rewards over the ticks of this call, float64 [B].
+        terminated: the task is solved, bool [B].
+        truncated: the budget ran out or the slot was quarantined, bool [B].
+        success: verdict of each slot at its last executed tick, bool [B].
+        step_index: control ticks executed in the episode so far, int [B].
+        info: diagnostics. Always has ``mended`` (bool [B], an action held NaN, infinities or values out of range),
+            ``fault`` (tuple of B strings, empty when healthy) and ``ticks`` (int [B], ticks executed in this call).
+    """
+
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    success: np.ndarray
+    step_index: np.ndarray
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def done(self) -> np.ndarray:
+        """Slots that are finished, bool [B]."""
+        return self.terminated | self.truncated
+
+
+@dataclass(frozen=True)
+class EePoseControl(Control):
+    """``step_ee_pose``'s return: control signals plus how the servo ended.
+
+    Attributes:
+        converged: position and rotation both within tolerance, bool [B].
+        final_pose: end-effector pose when the call ended, xyz + wxyz, [B, 7].
+        step_count: control ticks used by this call, int [B].
+        error: why a slot did not move ("" when it did), B strings.
+    """
+
+    converged: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    final_pose: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    step_count: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    error: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Egocentric:
+    """``observe_egocentric``'s return.
+
+    Attributes:
+        state: 8-D proprioception, float32 [B, 8]: end-effector position, axis-angle orientation, two finger positions.
+        rgb: third-person camera, uint8 [B, H, W, 3], or None when no camera is rendered.
+        wrist_image: wrist camera, uint8 [B, H, W, 3], or None.
+        depth: depth of the third-person camera in metres, float32 [B, H, W], or None.
+        pose: navigation pose; always None for manipulation.
+        intrinsics: camera matrices [B, 3, 3], or None.
+    """
+
+    state: np.ndarray
+    rgb: np.ndarray | None = None
+    wrist_image: np.ndarray | None = None
+    depth: np.ndarray | None = None
+    pose: None = None
+    intrinsics: np.ndarray | None = None
+
+    @property
+    def agentview_image(self) -> np.ndarray | None:
+        """LIBERO's name for ``rgb``."""
+        return self.rgb
+
+    @property
+    def observation(self) -> list[np.ndarray | None]:
+        """The two camera images in the order policies expect: third-person, wrist."""
+        return [self.rgb, self.wrist_image]
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Surface samples of one named thing: ``points`` [N, 3] and outward unit ``normals`` [N, 3], world frame."""
+
+    points: np.ndarray
+    normals: np.ndarray
+
+
+@dataclass(frozen=True)
+class RegionBox:
+    """A named place: a box with centre ``pos`` [3], rotation ``mat`` [3, 3] and ``half_extents`` [3], in metres.
+
+    ``parent`` is the object or fixture it belongs to, None for a place on the table or floor. ``axis`` is the axis along
+    which the part that carries it slides (a drawer's, unit vector [3]), None where nothing slides. World frame.
+    """
+
+    pos: np.ndarray
+    mat: np.ndarray
+    half_extents: np.ndarray
+    parent: str | None = None
+    axis: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class ObjectsSnapshot:
+    """Ground truth of one slot, as planners read it.
+
+    Attributes:
+        names: names of the movable objects, then of the fixtures, in the task's own vocabulary.
+        objects: name -> surface samples of its collision geometry.
+        poses: name -> pose of its origin, xyz + wxyz, [7]; goals are stated about origins.
+        regions: name -> box, the places goals speak of.
+        goal: the task's predicates, e.g. ``("on", "bowl_1", "plate_1")``; all must hold.
+        scene: surface samples of everything that collides, the robot excluded.
+        ee_pose: end-effector pose, xyz + wxyz, [7].
+        gripper: the two finger positions in metres, [2].
+        workspace: lower and upper corner of the workspace, [2, 3].
+        targets: names the task is about (``obj_of_interest``).
+        movable: the names that are not fixed to the world.
+    """
+
+    names: tuple[str, ...]
+    objects: dict[str, PointCloud]
+    poses: dict[str, np.ndarray]
+    regions: dict[str, RegionBox]
+    goal: tuple[tuple[str, ...], ...]
+    scene: PointCloud
+    ee_pose: np.ndarray
+    gripper: np.ndarray
+    workspace: np.ndarray
+    targets: tuple[str, ...] = ()
+    movable: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Objects:
+    """``observe_objects``'s return: one snapshot a slot, and why one is missing.
+
+    Attributes:
+        snapshot: B snapshots; None where ``error`` says why.
+        error: B strings, empty when the snapshot is there.
+    """
+
+    snapshot: tuple[ObjectsSnapshot | None, ...]
+    error: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """``evaluate``'s return: the verdict of each slot as of its last executed tick.
+
+    Attributes:
+        success: bool [B].
+        num_steps: control ticks executed, int [B].
+        suite: suite name.
+        task_id: int [B].
+        cumulative_reward: sum of rewards since the episode began, float64 [B].
+    """
+
+    success: np.ndarray
+    num_steps: np.ndarray
+    suite: str
+    task_id: np.ndarray
+    cumulative_reward: np.ndarray
+
+
+@dataclass(frozen=True)
+class State:
+    """Physics state of every slot.
+
+    Scenes differ in size, so rows are padded with zeros up to the widest scene of the batch; ``nq[i]`` and ``nv[i]``
+    say how much of row i is real.
+
+    Attributes:
+        qpos: [B, max nq].
+        qvel: [B, max nv].
+        time: simulated seconds, [B].
+        nq: int [B].
+        nv: int [B].
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    time: np.ndarray
+    nq: np.ndarray
+    nv: np.ndarray
+
+
+@runtime_checkable
+class BatchEnv(Protocol):
+    """The verbs. ``vecenv.make`` returns one of these whatever the simulator underneath."""
+
+    num_envs: int
+
+    def reset(self) -> ResetInfo:
+        """Make every slot live; live slots are left alone."""
+        ...
+
+    def step_continuous(self, actions: Any) -> Control:
+        """Advance by one tick, [B, 7], or a chunk, [B, K, 7]."""
+        ...
+
+    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+        """Drive the end effectors to absolute poses, [B, 8]."""
+        ...
+
+    def observe_egocentric(self) -> Egocentric:
+        """Cameras and proprioception."""
+        ...
+
+    def observe_objects(self, points: str = "surface") -> Objects:
+        """Ground truth."""
+        ...
+
+    def evaluate(self) -> Metrics:
+        """Verdicts."""
+        ...
+
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+        """Choose what each slot runs next, then call ``reset``."""
+        ...
+
+    def close(self) -> None:
+        """Release the simulator, once, at the end."""
+        ...
