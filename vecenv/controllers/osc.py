@@ -1,0 +1,664 @@
+"""Operational-space control of the Panda arm, for every slot of a batch at once: robosuite 1.4.0's ``OSC_POSE`` in JAX.
+
+In: the arm's kinematics and dynamics (``ArmState``), and once per control tick a 6-D action, which sets the goal pose.
+Out: joint torques for each physics substep. ``set_goal`` and ``torques`` take arrays with any leading batch axes and
+work under ``jit``, ``vmap`` and ``grad``; the dtype follows the inputs. ``compile_substeps`` gives the jitted functions
+that a simulator on the CPU calls once per physics substep, with one packed row per slot.
+
+How torques are computed: robosuite inverts ``J M⁻¹ Jᵀ``, which squares the conditioning of the arm. Here M = L Lᵀ is
+factored and the columns of X = L⁻¹ Jᵀ are made orthogonal (modified Gram-Schmidt). The torques are the same:
+
+* ``Jₚᵀ Λₚ F = L t``, where t is the shortest solution of ``Xₚᵀ t = F``; orientation likewise, with ``Xₒ`` alone.
+* ``Nᵀ M a = L r``, where r is what remains of ``Lᵀ a`` after removing its part in the span of X.
+
+A column that vanishes (an exactly singular arm) is dropped; robosuite's pseudo-inverse drops a singular value instead.
+Nothing calls LAPACK: matrices are held batch-last and every operation is elementwise over the slots, so no slot affects
+another, and ``compile_substeps`` gives a slot the same bits in any batch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
+
+from vecenv.controllers import gripper as gripper_control
+from vecenv.controllers.gripper import PANDA_GRIPPER, GripperConfig
+from vecenv.controllers.rotations import matmul, require_tail, safe_norm
+
+NUM_JOINTS = 7
+# Below this squared ratio to its own length a Gram-Schmidt remainder is rounding; robosuite's pinv uses the same 1e-15.
+_RANK_TOLERANCE = 1e-15
+
+
+@dataclass(frozen=True, kw_only=True)
+class OscConfig:
+    """Gains and limits of the controller; the defaults are robosuite's ``osc_pose.json`` and the Panda's actuators.
+
+    Attributes:
+        kp: stiffness of the end effector, 1/s².
+        damping_ratio: 1 is critical damping.
+        max_delta_pos: metres a full position action moves the goal.
+        max_delta_ori: radians a full rotation action turns the goal.
+        nullspace_kp: stiffness of the posture task, 1/s²; its damping is critical.
+        torque_limit: largest torque of each joint, N·m.
+    """
+
+    kp: float = 150.0
+    damping_ratio: float = 1.0
+    max_delta_pos: float = 0.05
+    max_delta_ori: float = 0.5
+    nullspace_kp: float = 10.0
+    torque_limit: tuple[float, ...] = (80.0, 80.0, 80.0, 80.0, 80.0, 12.0, 12.0)
+
+
+OSC_POSE = OscConfig()
+
+
+class ArmState(NamedTuple):
+    """What the controller reads of the arm, world frame, SI units.
+
+    Attributes:
+        qpos: joint angles, [..., 7].
+        qvel: joint velocities, [..., 7].
+        eef_pos: position of the grip site, [..., 3].
+        eef_mat: orientation of the grip site, [..., 3, 3].
+        jacobian: of the grip site, linear rows first, [..., 6, 7].
+        mass_matrix: joint-space inertia, [..., 7, 7].
+        bias: gravity and velocity-product torques, [..., 7].
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    eef_pos: jax.Array
+    eef_mat: jax.Array
+    jacobian: jax.Array
+    mass_matrix: jax.Array
+    bias: jax.Array
+
+
+class OscGoal(NamedTuple):
+    """Pose the controller pulls the grip site to: ``pos`` [..., 3] and ``mat`` [..., 3, 3], world frame."""
+
+    pos: jax.Array
+    mat: jax.Array
+
+
+_TAILS: tuple[tuple[int, ...], ...] = ((7,), (7,), (3,), (3, 3), (6, 7), (7, 7), (7,))
+
+
+def _check_arm(arm: ArmState) -> ArmState:
+    arm = ArmState(*map(jnp.asarray, arm))
+    for name, value, tail in zip(ArmState._fields, arm, _TAILS, strict=True):
+        require_tail(f"arm.{name}", value, tail)
+    return arm
+
+
+def _check_goal(goal: OscGoal) -> OscGoal:
+    goal = OscGoal(*map(jnp.asarray, goal))
+    require_tail("goal.pos", goal.pos, (3,))
+    require_tail("goal.mat", goal.mat, (3, 3))
+    return goal
+
+
+def hold_goal(arm: ArmState) -> OscGoal:
+    """The goal of a controller that was just loaded: stay at the arm's present pose."""
+    return OscGoal(jnp.asarray(arm.eef_pos), jnp.asarray(arm.eef_mat))
+
+
+def set_goal(arm: ArmState, goal: OscGoal, delta_action: jax.Array, config: OscConfig = OSC_POSE) -> OscGoal:
+    """Set the goal from a policy action, as ``OperationalSpaceController.set_goal`` does once per control tick.
+
+    The goal is relative to where the arm *is*, not to the previous goal. The orientation goal is kept when all three
+    rotation components are exactly 0 (robosuite compares with zero absolute tolerance), so an arm told not to rotate
+    returns to its last commanded orientation.
+
+    Args:
+        arm: current arm; only ``eef_pos`` and ``eef_mat`` are read.
+        goal: previous goal.
+        delta_action: position and rotation-vector action, [..., 6]; clipped to [-1, 1].
+        config: the controller.
+
+    Returns:
+        The new goal.
+
+    Raises:
+        ValueError: a shape does not match.
+    """
+    arm, goal, action = _check_arm(arm), _check_goal(goal), jnp.asarray(delta_action)
+    require_tail("delta_action", action, (6,))
+    return _next_goal(OscGoal(arm.eef_pos, arm.eef_mat), goal, action, config)
+
+
+def _next_goal(eef: OscGoal, goal: OscGoal, action: jax.Array, config: OscConfig) -> OscGoal:
+    """``set_goal`` from the pose of the end effector."""
+    action = jnp.clip(action, -1, 1)
+    rotvec = action[..., 3:] * config.max_delta_ori
+    turned = matmul(_robosuite_rotation(rotvec), eef.mat)
+    keep = (rotvec == 0).all(-1)[..., None, None]
+    return OscGoal(eef.pos + action[..., :3] * config.max_delta_pos, jnp.where(keep, goal.mat, turned))
+
+
+def _robosuite_rotation(rotvec: jax.Array) -> jax.Array:
+    """Rotation matrix of a rotation vector with robosuite's rounding (``quat2mat(axisangle2quat(v))``).
+
+    ``quat2mat`` works in float32 whatever it is given, which moves a goal by up to 1e-7 rad. The same roundings are
+    made here, in the order compiled robosuite makes them, so float64 goals agree to the last bits.
+    """
+    angle = safe_norm(rotvec)[..., None]
+    moving = angle > 0
+    axis = rotvec / jnp.where(moving, angle, 1)
+    single = _round_to_float32
+    quat = single(jnp.concatenate([jnp.cos(angle / 2), axis * jnp.sin(angle / 2)], axis=-1))
+    squares = single(quat * quat)
+    squared_norm = single(squares[..., 0] + squares[..., 1] + squares[..., 2] + squares[..., 3])
+    quat = single(quat * jnp.sqrt(2 / squared_norm)[..., None])
+    w, x, y, z = (quat[..., i] for i in range(4))
+    xx, yy, zz = single(x * x), single(y * y), single(z * z)
+    xy, xz, yz = single(x * y), single(x * z), single(y * z)
+    wx, wy, wz = single(w * x), single(w * y), single(w * z)
+    rows = [
+        [1 - yy - zz, single(xy - wz), single(xz + wy)],
+        [single(xy + wz), 1 - xx - zz, single(yz - wx)],
+        [single(xz - wy), single(yz + wx), 1 - xx - yy],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+@jax.custom_jvp
+def _round_to_float32(x: jax.Array) -> jax.Array:
+    # A cast there and back may be optimised away as excess precision; reduce_precision never is.
+    return lax.reduce_precision(x, exponent_bits=8, mantissa_bits=23)
+
+
+@_round_to_float32.defjvp
+def _round_to_float32_jvp(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    return _round_to_float32(*primals), tangents[0]
+
+
+def torques(arm: ArmState, goal: OscGoal, home_qpos: jax.Array, config: OscConfig = OSC_POSE) -> jax.Array:
+    """Joint torques that pull the grip site to the goal: ``OperationalSpaceController.run_controller``, then clipped.
+
+    Args:
+        arm: current arm.
+        goal: goal pose.
+        home_qpos: posture the redundant joint is drawn to, [..., 7]; robosuite takes the joints at reset.
+        config: the controller.
+
+    Returns:
+        Torques clipped to the limits, [..., 7].
+
+    Raises:
+        ValueError: a shape does not match.
+    """
+    arm, goal, home = _check_arm(arm), _check_goal(goal), jnp.asarray(home_qpos)
+    require_tail("home_qpos", home, (7,))
+    tails = (*_TAILS, (3,), (3, 3), (7,))
+    inputs = (*arm, *goal, home)
+    batch = jnp.broadcast_shapes(*(x.shape[: x.ndim - len(tail)] for x, tail in zip(inputs, tails, strict=True)))
+    last = [_batch_last(x, batch, tail) for x, tail in zip(inputs, tails, strict=True)]
+    result = _torques_last(ArmState(*last[:7]), OscGoal(*last[7:9]), last[9], config)
+    return jnp.moveaxis(result, -1, 0).reshape(*batch, NUM_JOINTS)
+
+
+def _batch_last(x: jax.Array, batch: tuple[int, ...], tail: tuple[int, ...]) -> jax.Array:
+    """[..., *tail] -> [*tail, N] with all batch axes flattened into the last."""
+    return jnp.moveaxis(jnp.broadcast_to(x, batch + tail).reshape(-1, *tail), 0, -1)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Batch-last arithmetic: arrays are [rows, columns, slots] from here on. The work is cut into stages; compiled for the
+# CPU each is fenced, see ``_stage``.
+
+
+def _stage(fence: bool, function: Callable[..., Any], *args: Any) -> Any:
+    """Apply a stage; with ``fence``, as a call that XLA compiles on its own.
+
+    XLA's CPU fusion copies a cheap producer into each of its consumers, and along a chain of eliminations that repeats
+    the first steps thousands of times. ``optimization_barrier`` is gone before fusion runs; a call that may not be
+    inlined stays. 512 slots take 0.5 ms instead of 2.
+    """
+    if not fence:
+        return function(*args)
+
+    def without_mark(*args: Any) -> Any:
+        with set_xla_metadata(inlineable=None):
+            return function(*args)
+
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(without_mark)(*args)
+
+
+def _sum_rows(x: jax.Array) -> jax.Array:
+    """Sum over axis 0 in a fixed order, elementwise over the rest."""
+    total = x[0]
+    for i in range(1, x.shape[0]):
+        total = total + x[i]
+    return total
+
+
+def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Cross product of [3, ...] with [3, ...]."""
+    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _torques_last(
+    arm: ArmState, goal: OscGoal, home: jax.Array, config: OscConfig, *, fence: bool = False
+) -> jax.Array:
+    """``torques`` on batch-last arrays: [7, N]."""
+    force, moment, acceleration = _stage(fence, partial(_desired, config=config), arm, goal, home)
+    tables = [_stage(fence, _table, arm.mass_matrix, arm.jacobian, acceleration)]
+    for _ in range(NUM_JOINTS - 1):
+        tables.append(_stage(fence, _eliminate_row, tables[-1]))
+    factor, whitened = _stage(fence, _scale_rows, tables)
+    both, turning, floor, turning_floor = _stage(fence, _systems, whitened, force, moment)
+    basis, rest = _orthogonalise(both, floor, 6, fence)
+    turning_basis, _ = _orthogonalise(turning, turning_floor, 3, fence)
+    # Rounding leaves up to a condition number of the projection behind: project a second time.
+    left = _stage(fence, _components, basis, rest)
+    free = _stage(fence, _remove_all, basis, left, rest)
+    linear, angular = _stage(fence, _solutions, basis[:3], turning_basis)
+    total = _stage(fence, _add_solutions, basis[:3] + turning_basis, linear + angular, free)
+    return _stage(fence, partial(_finish, config=config), factor, total, arm.bias)
+
+
+def _desired(arm: ArmState, goal: OscGoal, home: jax.Array, *, config: OscConfig) -> tuple[jax.Array, ...]:
+    """Desired linear [3, N], angular [3, N] and joint [7, N] accelerations: springs and dampers."""
+    kd = 2 * math.sqrt(config.kp) * config.damping_ratio
+    velocity = _sum_rows(jnp.moveaxis(arm.jacobian * arm.qvel, 1, 0))
+    turn = sum(_cross(arm.eef_mat[:, i], goal.mat[:, i]) for i in range(3))
+    force = config.kp * (goal.pos - arm.eef_pos) - kd * velocity[:3]
+    moment = 0.5 * config.kp * turn - kd * velocity[3:]
+    joint_kd = 2 * math.sqrt(config.nullspace_kp)
+    return force, moment, config.nullspace_kp * (home - arm.qpos) - joint_kd * arm.qvel
+
+
+def _table(mass_matrix: jax.Array, jacobian: jax.Array, acceleration: jax.Array) -> jax.Array:
+    """[M | Jᵀ | M a], [7, 14, N]: eliminating M's lower triangle leaves the rows of D Lᵀ, D X and D Lᵀ a."""
+    inertial = _sum_rows(mass_matrix * acceleration[:, None])
+    return jnp.concatenate([mass_matrix, jnp.moveaxis(jacobian, 0, 1), inertial[:, None]], axis=1)
+
+
+def _eliminate_row(rest: jax.Array) -> jax.Array:
+    """One step of Gaussian elimination without pivoting (M is positive definite): [k, m, N] -> [k - 1, m - 1, N]."""
+    pivot = rest[0, 1:]
+    return rest[1:, 1:] - (pivot[: rest.shape[0] - 1] / rest[0, 0])[:, None] * pivot
+
+
+def _scale_rows(tables: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """Lᵀ [7, 7, N], zero below the diagonal, and [X | Lᵀ a] [7, 7, N], from the first rows of the tables."""
+    rows = [table[0] for table in tables]
+    scale = lax.rsqrt(jnp.stack([row[0] for row in rows]))[:, None]
+    factor = [jnp.concatenate([jnp.zeros_like(row[:i]), row[: NUM_JOINTS - i]]) for i, row in enumerate(rows)]
+    whitened = [row[NUM_JOINTS - i :] for i, row in enumerate(rows)]
+    return jnp.stack(factor) * scale, jnp.stack(whitened) * scale
+
+
+def _systems(whitened: jax.Array, force: jax.Array, moment: jax.Array) -> tuple[jax.Array, ...]:
+    """What Gram-Schmidt works on: columns [8, k, N] whose eighth entry is the column's right-hand side.
+
+    Returns:
+        Position and posture system [8, 7, N], orientation system [8, 3, N], and for each column of either the squared
+        length under which what remains of it is rounding, [6, N] and [3, N].
+    """
+    columns = whitened[:, :6]
+    sides = jnp.concatenate([force, jnp.zeros_like(whitened[0, 3:])])
+    epsilon = float(jnp.finfo(whitened.dtype).eps)
+    floor = max(_RANK_TOLERANCE, (16 * epsilon) ** 2) * _sum_rows(columns * columns)
+    turning = jnp.concatenate([columns[:, 3:], moment[None]])
+    return jnp.concatenate([whitened, sides[None]]), turning, floor, floor[3:]
+
+
+class _Direction(NamedTuple):
+    """One orthogonal direction: the first column of ``block`` [8, k, N], and its ``inverse`` squared length [N]."""
+
+    block: jax.Array
+    inverse: jax.Array
+
+
+def _orthogonalise(block: jax.Array, floor: jax.Array, count: int, fence: bool) -> tuple[list[_Direction], jax.Array]:
+    """Modified Gram-Schmidt over the first ``count`` columns of a system [8, k, N].
+
+    Returns:
+        The orthogonal directions, and what remains of the other columns [8, k - count, N].
+    """
+    basis = []
+    for k in range(count):
+        inverse, ratio = _stage(fence, partial(_project, index=k), block, floor)
+        basis.append(_Direction(block, inverse))
+        block = _stage(fence, _remove, block, ratio)
+    return basis, block
+
+
+def _project(block: jax.Array, floor: jax.Array, *, index: int) -> tuple[jax.Array, jax.Array]:
+    """Inverse squared length of the first column [N] and the other columns' components along it [k - 1, N]."""
+    pivot = block[:7, 0]
+    squared = _sum_rows(pivot * pivot)
+    kept = squared > floor[index]
+    inverse = jnp.where(kept, 1 / jnp.where(kept, squared, 1), 0)
+    return inverse, _sum_rows(pivot[:, None] * block[:7, 1:]) * inverse
+
+
+def _remove(block: jax.Array, ratio: jax.Array) -> jax.Array:
+    """The other columns less their component along the first, [8, k - 1, N]."""
+    return block[:, 1:] - block[:, :1] * ratio
+
+
+def _components(basis: list[_Direction], rest: jax.Array) -> list[jax.Array]:
+    """Components [N] of the last column [8, 1, N] along each direction."""
+    return [_sum_rows(along.block[:7, 0] * rest[:7, 0]) * along.inverse for along in basis]
+
+
+def _remove_all(basis: list[_Direction], components: list[jax.Array], rest: jax.Array) -> jax.Array:
+    """The last column less these components, [7, N]."""
+    vector = rest[:7, 0]
+    for along, component in zip(basis, components, strict=True):
+        vector = vector - along.block[:7, 0] * component
+    return vector
+
+
+def _solutions(*bases: list[_Direction]) -> list[list[jax.Array]]:
+    """Components [N] along each direction of the shortest solution of each system.
+
+    The k-th would be ``rhs_k / length_k²`` were the directions exactly orthogonal; subtracting what the later ones
+    contribute makes the method backward stable (Björck and Paige 1992, minimum norm). In float32 the worst of 20,000
+    random arms is then off by 0.002 N·m instead of 0.03.
+    """
+    found = []
+    for basis in bases:
+        vectors = [along.block[:, 0] for along in basis]
+        components = [vectors[-1][7] * basis[-1].inverse]
+        for k in range(len(basis) - 2, -1, -1):
+            left = vectors[k][7]
+            for vector, component in zip(vectors[k + 1 :], components, strict=True):
+                left = left - _sum_rows(vectors[k][:7] * vector[:7]) * component
+            components.insert(0, left * basis[k].inverse)
+        found.append(components)
+    return found
+
+
+def _add_solutions(basis: list[_Direction], components: list[jax.Array], free: jax.Array) -> jax.Array:
+    """Whitened torque [7, N]: the shortest solutions of both systems plus the posture's free part."""
+    for along, component in zip(basis, components, strict=True):
+        free = free + along.block[:7, 0] * component
+    return free
+
+
+def _finish(factor: jax.Array, whitened: jax.Array, bias: jax.Array, *, config: OscConfig) -> jax.Array:
+    """Torques ``L whitened + bias``, clipped, [7, N]."""
+    raw = _sum_rows(factor * whitened[:, None]) + bias
+    limit = jnp.asarray(config.torque_limit, raw.dtype)[:, None]
+    return jnp.clip(raw, -limit, limit)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The native backend's entry: one packed row per slot, one jitted call per physics substep.
+
+# Widths of a packed row's fields, in order. The mass matrix is its lower triangle, row by row.
+PACKED_FIELDS = {
+    "qpos": 7,
+    "qvel": 7,
+    "eef_pos": 3,
+    "eef_mat": 9,
+    "xanchor": 21,
+    "xaxis": 21,
+    "mass_lower": 28,
+    "bias": 7,
+}
+PACKED_SIZE = sum(PACKED_FIELDS.values())
+
+
+def packed_slices() -> dict[str, slice]:
+    """Columns of each field in a packed row, by name."""
+    ends = np.cumsum(list(PACKED_FIELDS.values()))
+    return {
+        name: slice(int(end) - width, int(end)) for (name, width), end in zip(PACKED_FIELDS.items(), ends, strict=True)
+    }
+
+
+def arm_from_packed(packed: jax.Array) -> ArmState:
+    """Read an arm from packed rows.
+
+    Args:
+        packed: [..., 103]: joint angles 7, joint velocities 7, grip site position 3 and orientation 9 (row-major),
+            joint anchors 7x3, joint axes 7x3 (all world frame), lower triangle of the mass matrix 28 (row i has
+            i + 1 entries), bias torques 7. All joints are hinges.
+
+    Returns:
+        The arm. Column j of the Jacobian is ``axis_j x (eef - anchor_j)`` over ``axis_j``.
+
+    Raises:
+        ValueError: the last axis is not 103 wide.
+    """
+    packed = jnp.asarray(packed)
+    require_tail("packed", packed, (PACKED_SIZE,))
+    arm = _unpack_last(_batch_last(packed, packed.shape[:-1], (PACKED_SIZE,)))
+    return ArmState(*(jnp.moveaxis(x, -1, 0).reshape(*packed.shape[:-1], *x.shape[:-1]) for x in arm))
+
+
+def _unpack_last(rows: jax.Array, *, fence: bool = False) -> ArmState:
+    """Batch-last arm of packed rows [103, N]."""
+    field = {name: rows[columns] for name, columns in packed_slices().items()}
+    geometry = (field["eef_pos"], field["xanchor"], field["xaxis"], field["mass_lower"])
+    jacobian, mass_matrix = _stage(fence, _assemble, *geometry)
+    mat = field["eef_mat"].reshape(3, 3, -1)
+    return ArmState(field["qpos"], field["qvel"], field["eef_pos"], mat, jacobian, mass_matrix, field["bias"])
+
+
+def _assemble(eef: jax.Array, anchor: jax.Array, axis: jax.Array, lower: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Jacobian [6, 7, N] and mass matrix [7, 7, N]."""
+    axis = jnp.moveaxis(axis.reshape(NUM_JOINTS, 3, -1), 1, 0)
+    arm = eef[:, None] - jnp.moveaxis(anchor.reshape(NUM_JOINTS, 3, -1), 1, 0)
+    row, column = np.indices((NUM_JOINTS, NUM_JOINTS))
+    high, low = np.maximum(row, column), np.minimum(row, column)
+    return jnp.concatenate([_cross(axis, arm), axis]), lower[high * (high + 1) // 2 + low]
+
+
+class ControlState(NamedTuple):
+    """What the controllers of a batch remember between physics substeps.
+
+    Attributes:
+        goal: the OSC goal of each slot.
+        gripper: integrated finger targets, [B, 2].
+        grip: gripper action of the present tick, [B].
+        home: packed arm at reset, [B, 103]; its joint angles are the posture the arm is drawn to.
+    """
+
+    goal: OscGoal
+    gripper: jax.Array
+    grip: jax.Array
+    home: jax.Array
+
+
+def initial_control_state(home_packed: Any) -> ControlState:
+    """Controllers as they are after a reset: goal at the home pose, gripper target in the middle.
+
+    Args:
+        home_packed: packed arm at reset, [B, 103]: joints at robosuite's ``init_qpos``, at rest, fingers at 0 (the
+            controller is loaded before the fingers are placed).
+
+    Returns:
+        The state of B controllers, on the device of ``home_packed``.
+
+    Raises:
+        ValueError: ``home_packed`` is not [B, 103].
+    """
+    home = jnp.asarray(home_packed)
+    _require_rows("home_packed", home, PACKED_SIZE, home.shape[0] if home.ndim else 0)
+    pose = _packed_pose(home)
+    return ControlState(pose, jnp.zeros_like(home[:, :2]), jnp.zeros_like(home[:, 0]), home)
+
+
+def rearm(state: ControlState, mask: Any) -> ControlState:
+    """Put the slots in ``mask``, bool [B], back to ``initial_control_state``; the others keep theirs."""
+    fresh = initial_control_state(state.home)
+    chosen = jnp.asarray(mask)
+    return jax.tree.map(lambda new, old: jnp.where(_align(chosen, old), new, old), fresh, state)
+
+
+def _align(mask: jax.Array, array: jax.Array) -> jax.Array:
+    return mask.reshape(mask.shape + (1,) * (array.ndim - mask.ndim))
+
+
+def _packed_pose(packed: jax.Array) -> OscGoal:
+    columns = packed_slices()
+    return OscGoal(packed[:, columns["eef_pos"]], packed[:, columns["eef_mat"]].reshape(-1, 3, 3))
+
+
+def _require_rows(name: str, array: jax.Array, width: int, rows: int) -> None:
+    if array.shape != (rows, width):
+        raise ValueError(f"{name} must have shape [{rows}, {width}], got {list(array.shape)}")
+
+
+def begin_tick(
+    state: ControlState,
+    packed: jax.Array,
+    action: jax.Array,
+    stale: jax.Array,
+    config: OscConfig = OSC_POSE,
+    gripper: GripperConfig = PANDA_GRIPPER,
+    *,
+    fence: bool = False,
+) -> tuple[jax.Array, ControlState]:
+    """First physics substep of a control tick: take the action as the new goal, then compute the controls.
+
+    Args:
+        state: the controllers.
+        packed: packed arms, [B, 103].
+        action: policy actions, [B, 7]: position, rotation vector, gripper (+1 closes).
+        stale: bool [B], the slots whose controller still sees the arm of the reset. After ``reset(); set_init_state()``
+            robosuite's controller believes it is up to date, so in the first substep of an episode it computes the
+            goal and the torques from the home arm; only the bias torques are read from the simulator.
+        config: the arm controller.
+        gripper: the gripper.
+        fence: compile in stages, for the CPU; see ``compile_substeps``.
+
+    Returns:
+        Actuator commands [B, 9] (seven torques, two finger targets) and the controllers after this substep.
+
+    Raises:
+        ValueError: a shape does not match.
+    """
+    rows = state.home.shape[0]
+    packed, action = jnp.asarray(packed), jnp.asarray(action, state.home.dtype)
+    _require_rows("packed", packed, PACKED_SIZE, rows)
+    _require_rows("action", action, 7, rows)
+    current = jnp.arange(PACKED_SIZE) >= packed_slices()["bias"].start
+    packed = jnp.where(jnp.asarray(stale)[:, None] & ~current, state.home, packed)
+    goal = _next_goal(_packed_pose(packed), state.goal, action[:, :6], config)
+    return continue_tick(state._replace(goal=goal, grip=action[:, 6]), packed, config, gripper, fence=fence)
+
+
+def continue_tick(
+    state: ControlState,
+    packed: jax.Array,
+    config: OscConfig = OSC_POSE,
+    gripper: GripperConfig = PANDA_GRIPPER,
+    *,
+    fence: bool = False,
+) -> tuple[jax.Array, ControlState]:
+    """Any later physics substep of a control tick: compute the controls for the goal already set.
+
+    Args, returns and raises as in ``begin_tick``.
+    """
+    packed = jnp.asarray(packed)
+    _require_rows("packed", packed, PACKED_SIZE, state.home.shape[0])
+    arm = _unpack_last(_stage(fence, jnp.transpose, packed), fence=fence)
+    goal = OscGoal(*(jnp.moveaxis(x, 0, -1) for x in state.goal))
+    torque = _torques_last(arm, goal, state.home[:, :NUM_JOINTS].T, config, fence=fence)
+    fingers = gripper_control.integrate(state.gripper, state.grip, gripper)
+    ctrl = jnp.concatenate([torque.T, gripper_control.command(fingers, gripper)], axis=-1)
+    return ctrl, state._replace(gripper=fingers)
+
+
+class Substeps(NamedTuple):
+    """Compiled controllers of a batch: NumPy in, NumPy controls out, their memory kept in a ``ControlState``.
+
+    Attributes:
+        start: ``start(home_packed [B, 103]) -> ControlState``.
+        begin: ``begin(state, packed [B, 103], action [B, 7], stale [B]) -> (ctrl [B, 9], state)``; see ``begin_tick``.
+        proceed: ``proceed(state, packed [B, 103]) -> (ctrl [B, 9], state)``; see ``continue_tick``.
+        rearm: ``rearm(state, mask [B]) -> state``.
+    """
+
+    start: Callable[[Any], ControlState]
+    begin: Callable[[ControlState, Any, Any, Any], tuple[np.ndarray, ControlState]]
+    proceed: Callable[[ControlState, Any], tuple[np.ndarray, ControlState]]
+    rearm: Callable[[ControlState, Any], ControlState]
+
+
+# Fusion emitters repeat shared work; the concurrency-optimised schedule wakes threads for microseconds of work.
+_CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_enable_concurrency_optimized_scheduler": False}
+
+
+def _in_whole_vectors(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Run on a batch padded to a multiple of 8 slots, so that no slot falls into a loop's remainder.
+
+    The remainder is compiled apart and may fuse other multiplications with additions: without this, a slot's torques
+    differ in the last bit between batch sizes (seen at 5 slots).
+    """
+
+    def padded(state: ControlState, packed: Any, *inputs: Any) -> Any:
+        count = packed.shape[0]
+        missing = -count % 8
+        if not missing or any(x.shape[:1] != (count,) for x in (*inputs, *jax.tree.leaves(state))):
+            return function(state, packed, *inputs)
+        args = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], missing, 0)]), (state, packed, *inputs))
+        return jax.tree.map(lambda x: x[:count], function(*args))
+
+    return padded
+
+
+def compile_substeps(config: OscConfig = OSC_POSE, gripper: GripperConfig = PANDA_GRIPPER) -> Substeps:
+    """Controllers for a simulator that runs on the CPU in float64, one jitted call per physics substep.
+
+    Each batch size compiles once, in about a second for each function. float64 is switched on for these calls only, and
+    they run on the CPU whatever JAX's default device is. Keep ``packed`` float64: another dtype compiles again.
+
+    Args:
+        config: the arm controller.
+        gripper: the gripper.
+
+    Returns:
+        The functions to call.
+    """
+    cpu = jax.devices("cpu")[0]
+
+    def begin(state: ControlState, packed: Any, action: Any, stale: Any) -> tuple[jax.Array, ControlState]:
+        return begin_tick(state, packed, action, stale, config, gripper, fence=True)
+
+    def proceed(state: ControlState, packed: Any) -> tuple[jax.Array, jax.Array]:
+        ctrl, following = continue_tick(state, packed, config, gripper, fence=True)
+        return ctrl, following.gripper
+
+    jitted_begin = jax.jit(_in_whole_vectors(begin), compiler_options=_CPU_OPTIONS)
+    jitted_proceed = jax.jit(_in_whole_vectors(proceed), compiler_options=_CPU_OPTIONS)
+    jitted_rearm = jax.jit(rearm)
+
+    def run_start(home_packed: Any) -> ControlState:
+        with jax.enable_x64(True), jax.default_device(cpu):
+            return jax.device_put(initial_control_state(np.asarray(home_packed, np.float64)), cpu)
+
+    def run_begin(state: ControlState, packed: Any, action: Any, stale: Any) -> tuple[np.ndarray, ControlState]:
+        with jax.enable_x64(True):
+            ctrl, following = jitted_begin(state, packed, action, stale)
+        return np.asarray(ctrl), following
+
+    def run_proceed(state: ControlState, packed: Any) -> tuple[np.ndarray, ControlState]:
+        with jax.enable_x64(True):
+            ctrl, fingers = jitted_proceed(state, packed)
+        return np.asarray(ctrl), state._replace(gripper=fingers)
+
+    def run_rearm(state: ControlState, mask: Any) -> ControlState:
+        with jax.enable_x64(True):
+            return jitted_rearm(state, mask)
+
+    return Substeps(run_start, run_begin, run_proceed, run_rearm)

@@ -1,0 +1,654 @@
+"""The LIBERO environment: suites, scenes, physics, controller and goals behind the verbs of ``vecenv.contract``.
+
+A batch of slots, each with one episode of one task of a suite. Tasks of one scene share a compiled model and differ in
+their start states, goals and instructions, which are data. Read ``vecenv/contract.py`` for what the verbs promise and
+``vecenv/physics/native.py`` for what happens in a control step.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from vecenv import actions as action_space
+from vecenv import placement as placing
+from vecenv.contract import (
+    Control,
+    EePoseControl,
+    Egocentric,
+    Metrics,
+    Objects,
+    ObjectsSnapshot,
+    PointCloud,
+    RegionBox,
+    ResetInfo,
+    State,
+)
+from vecenv.controllers import waypoint
+from vecenv.libero import fixtures as fixture_poses
+from vecenv.libero import goals, surface
+from vecenv.libero.bddl import Problem
+from vecenv.libero.scene import Scene, compile_scene
+from vecenv.libero.suites import NUM_EPISODES, TaskSpec, list_tasks
+from vecenv.physics.native import Group, NativePhysics, Start
+
+# What LIBERO evaluations send while objects settle after a reset: no motion, gripper open.
+SETTLE_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+MAX_STEPS = 2500
+
+
+class LiberoError(ValueError):
+    """An option or call that this environment cannot honour; the message says what would be right."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiberoConfig:
+    """Options of a LIBERO batch.
+
+    Attributes:
+        backend: ``"native"`` (MuJoCo in C threads).
+        geometry: ``"exact"``, upstream's collision geoms.
+        fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), or name -> (pos [3] or [B, 3] in
+            metres, quat wxyz [4] or [B, 4]), world frame.
+        start: ``"raw"``, the stored init states followed by ``settle_steps``.
+        settle_steps: control ticks with no motion and an open gripper before an episode begins; they do not count.
+        max_steps: step budget of an episode in control ticks.
+        seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode.
+        num_threads: C threads; None for one a core.
+        waypoint: tolerances and speeds of ``step_ee_pose``.
+    """
+
+    backend: str = "native"
+    geometry: str = "exact"
+    fixtures: str | Mapping[str, Any] = "center"
+    start: str = "raw"
+    settle_steps: int = 10
+    max_steps: int = MAX_STEPS
+    seed: int = 0
+    num_threads: int | None = None
+    waypoint: waypoint.WaypointConfig = field(default_factory=waypoint.WaypointConfig)
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("backend", ("native",)), ("geometry", ("exact",)), ("start", ("raw",))):
+            if getattr(self, name) not in allowed:
+                raise LiberoError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
+        if self.settle_steps < 0 or self.max_steps < 1:
+            raise LiberoError(f"settle_steps={self.settle_steps}, max_steps={self.max_steps}: need >= 0 and >= 1")
+        if self.num_threads is not None and self.num_threads < 1:
+            raise LiberoError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
+
+
+@functools.lru_cache(maxsize=64)
+def _compiled(problem: Problem, pairs: tuple[tuple[str, str], ...]) -> Scene:
+    return compile_scene(problem, contact_pairs=pairs)
+
+
+_Servo: TypeAlias = Callable[..., tuple[np.ndarray, waypoint.Pose]]
+
+
+@functools.lru_cache(maxsize=8)
+def _servo(config: waypoint.WaypointConfig) -> tuple[_Servo, Callable[..., np.ndarray]]:
+    """The compiled servo: the action of a tick, held where asked, with the next reference; and who has arrived."""
+
+    @jax.jit
+    def tick(
+        current: waypoint.Pose, target: waypoint.Pose, grip: jax.Array, reference: waypoint.Pose, hold: jax.Array
+    ) -> tuple[jax.Array, waypoint.Pose]:
+        moving, ahead = waypoint.servo(current, target, grip, reference, config)
+        return jnp.where(hold[:, None], waypoint.hold_action(grip), moving), ahead
+
+    reached = jax.jit(functools.partial(waypoint.converged, config=config))
+
+    def run_tick(*args: Any) -> tuple[np.ndarray, waypoint.Pose]:
+        with jax.enable_x64(True):
+            actions, ahead = tick(*args)
+        return np.asarray(actions), ahead
+
+    def run_reached(*args: Any) -> np.ndarray:
+        with jax.enable_x64(True):
+            return np.asarray(reached(*args))
+
+    return run_tick, run_reached
+
+
+@dataclass(frozen=True)
+class _TaskData:
+    """What one task adds to its scene."""
+
+    spec: TaskSpec
+    problem: Problem
+    scene: int
+
+
+class LiberoEnv:
+    """A batch of LIBERO episodes; see ``vecenv.make``.
+
+    Args:
+        suite: one of ``vecenv.list_suites()``.
+        placement: task and episode of each slot.
+        config: options.
+
+    Raises:
+        LiberoError, SceneError, GoalError, FixtureError, TaskDataError: something the options ask for does not exist.
+    """
+
+    def __init__(self, suite: str, placement: placing.Placement, config: LiberoConfig) -> None:
+        self.suite, self.config = suite, config
+        self.num_envs = len(placement)
+        self._specs = list_tasks(suite)
+        self._closed = False
+        self._physics: NativePhysics | None = None
+        self._place(placement)
+
+    # -- placement and lifecycle ---------------------------------------------------------------------------------------
+
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+        """Choose what each slot runs next; ``reset`` makes it live.
+
+        Args:
+            tasks: task index of each slot (B of them, or one for all); None keeps them.
+            episodes: init state of each slot, likewise.
+
+        Raises:
+            PlacementError: an index that does not exist, or a wrong number of them.
+        """
+        self._check_open()
+        counts = {"num_tasks": len(self._specs), "num_episodes": NUM_EPISODES}
+        self._place(placing.each(tasks, episodes, self._placement, **counts))
+
+    def _place(self, placement: placing.Placement) -> None:
+        self._placement = placement
+        self._build()
+        b = self.num_envs
+        self._live = np.zeros(b, bool)
+        self._terminated = np.zeros(b, bool)
+        self._truncated = np.zeros(b, bool)
+        self._success = np.zeros(b, bool)
+        self._steps = np.zeros(b, int)
+        self._reward = np.zeros(b)
+        self._fault = [""] * b
+
+    def _build(self) -> None:
+        """Scenes, physics and goal tables for the current placement; what still fits is kept."""
+        indices = np.unique(self._placement.task)
+        problems = {int(i): self._specs[i].problem() for i in indices}
+        keys = list(dict.fromkeys(problem.scene_key() for problem in problems.values()))
+        scenes = []
+        for key in keys:
+            sharing = [problem for problem in problems.values() if problem.scene_key() == key]
+            scenes.append(_compiled(sharing[0], goals.contact_pairs(sharing)))
+        fixture_poses.check_names(self.config.fixtures, scenes)
+        self._tasks = {
+            i: _TaskData(self._specs[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
+        }
+        scene_of_slot = np.array([self._tasks[int(task)].scene for task in self._placement.task])
+        if self._physics is None or not self._physics.serves(scenes, scene_of_slot):
+            self._close_physics()
+            self._physics = NativePhysics(scenes, scene_of_slot, self.config.num_threads)
+        self._goals = [self._goal_table(group) for group in self._physics.groups]
+
+    def _goal_table(self, group: Group) -> goals.GoalTable:
+        tasks = self._placement.task[group.slots]
+        present = [int(task) for task in np.unique(tasks)]
+        rows = [present.index(int(task)) for task in tasks]
+        return goals.build_table([self._tasks[task].problem for task in present], group.scene, rows)
+
+    def reset(self) -> ResetInfo:
+        """Make every slot live: finished slots are re-armed in place, live ones are left alone.
+
+        Returns:
+            Episode metadata of every slot; no observation.
+        """
+        self._check_open()
+        stale = ~self._live | self._done
+        if stale.any():
+            self._arm(stale)
+        return ResetInfo(
+            instruction=tuple(self._tasks[int(task)].spec.instruction for task in self._placement.task),
+            episode_id=tuple(
+                f"{self.suite}/{task}/{episode}"
+                for task, episode in zip(self._placement.task, self._placement.episode, strict=True)
+            ),
+            suite=self.suite,
+            task_id=self._placement.task.copy(),
+            max_steps=np.full(self.num_envs, self.config.max_steps),
+        )
+
+    def _arm(self, stale: np.ndarray) -> None:
+        for group in self.physics.groups:
+            for task in np.unique(self._placement.task[group.slots]):
+                slots = group.slots[(self._placement.task[group.slots] == task) & stale[group.slots]]
+                if len(slots):
+                    self.physics.place(group, slots, self._start(group.scene, int(task), slots))
+        for array in (self._terminated, self._truncated, self._success, self._steps, self._reward):
+            array[stale] = 0
+        for slot in np.flatnonzero(stale):
+            self._fault[slot] = ""
+        self._live |= stale
+        settle = np.tile(SETTLE_ACTION, (self.num_envs, 1))
+        for _ in range(self.config.settle_steps):
+            self.physics.control_step(settle, stale)
+        self._quarantine(stale)
+
+    def _start(self, scene: Scene, task: int, slots: np.ndarray) -> Start:
+        data = self._tasks[task]
+        episodes = self._placement.episode[slots]
+        states = data.spec.init_states()[episodes]
+        nq, nv = scene.model.nq, scene.model.nv
+        if states.shape[1] != 1 + nq + nv:
+            raise LiberoError(
+                f"{data.spec.init_states_path}: rows of {states.shape[1]} numbers, but the scene has 1 + {nq} + {nv}"
+            )
+        bodies, pos, quat = fixture_poses.poses(
+            data.problem,
+            scene,
+            self.config.fixtures,
+            keys=[(self.config.seed, self.suite, task, int(episode)) for episode in episodes],
+            slots=slots.tolist(),
+        )
+        return Start(qpos=states[:, 1 : 1 + nq], qvel=states[:, 1 + nq :], bodies=bodies, body_pos=pos, body_quat=quat)
+
+    def close(self) -> None:
+        """Release the physics; the environment cannot be used afterwards. Closing twice is harmless."""
+        self._close_physics()
+        self._closed = True
+
+    def _close_physics(self) -> None:
+        if self._physics is not None:
+            self._physics.close()
+        self._physics = None
+
+    # -- stepping ------------------------------------------------------------------------------------------------------
+
+    def step_continuous(self, actions: Any) -> Control:
+        """Advance by one control tick, or by a chunk of K.
+
+        Args:
+            actions: [B, 7] or [B, K, 7], each row dx dy dz, axis-angle rotation, gripper (+1 closes), in [-1, 1].
+
+        Raises:
+            ActionError: not numbers, or another shape.
+        """
+        self._check_live()
+        chunk, mended = action_space.continuous(actions, self.num_envs)
+        before, reward = self._steps.copy(), np.zeros(self.num_envs)
+        for k in range(chunk.shape[1]):
+            if self._done.all():
+                break
+            reward += self._tick(chunk[:, k], ~self._done)
+        return self._control(Control, reward, mended, before)
+
+    def _tick(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """One control tick of the active slots; returns its rewards [B]."""
+        self.physics.control_step(actions, active)
+        self._steps[active] += 1
+        success = self._judge() & active
+        self._success[active] = success[active]
+        reward = success.astype(float)
+        self._reward += reward
+        self._terminated |= success
+        self._truncated |= active & ~success & (self._steps >= self.config.max_steps)
+        self._quarantine(active)
+        return np.where(self._success, reward, 0.0)
+
+    def _judge(self) -> np.ndarray:
+        """The goals on the kinematics and contacts that the last physics call left, bool [B]."""
+        verdict = np.zeros(self.num_envs, bool)
+        for group, table in zip(self.physics.groups, self._goals, strict=True):
+            verdict[group.slots] = goals.evaluate(
+                table,
+                xpos=group.xpos,
+                site_xpos=group.site_xpos,
+                site_xmat=group.site_xmat,
+                qpos=group.qpos,
+                touch=group.touch,
+            )
+        return verdict
+
+    def _quarantine(self, among: np.ndarray) -> None:
+        for slot, reason in enumerate(self.physics.fault):
+            if reason and among[slot] and not self._fault[slot]:
+                self._fault[slot] = reason
+                self._truncated[slot] = True
+                self._terminated[slot] = self._success[slot] = False
+
+    def _control(self, kind: type, reward: np.ndarray, mended: np.ndarray, before: np.ndarray, **extra: Any) -> Any:
+        return kind(
+            reward=reward,
+            terminated=self._terminated.copy(),
+            truncated=self._truncated.copy(),
+            success=self._success.copy(),
+            step_index=self._steps.copy(),
+            info={"mended": mended, "fault": tuple(self._fault), "ticks": self._steps - before},
+            **extra,
+        )
+
+    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+        """Drive each end effector to an absolute pose, or hold it while the gripper moves.
+
+        Every slot advances on its own, at most 5 mm and 0.05 rad a tick, until it is within tolerance, finished, or
+        out of ticks (``config.waypoint``); it uses at least one tick, so the gripper command is always given.
+        ``hold_steps`` > 0 skips the drive: that many ticks without motion. Poses are those of the grip site's position
+        and the hand's orientation, the frame ``observe_egocentric`` and ``observe_objects`` report.
+
+        Args:
+            poses: [B, 8] xyz (metres), wxyz, grip (1 closed, 0 open), world frame; empty for a no-op. Also a mapping
+                with ``pose`` and ``hold_steps``.
+            hold_steps: ticks to hold, one number or [B].
+
+        Raises:
+            ActionError: not numbers, or another shape.
+        """
+        self._check_live()
+        if isinstance(poses, Mapping):
+            poses, hold_steps = poses.get("pose", ()), poses.get("hold_steps", hold_steps)
+        targets: Any
+        targets, moves, errors = action_space.ee_poses(poses, self.num_envs)
+        hold = action_space.hold_steps(hold_steps, self.num_envs)
+        before, reward = self._steps.copy(), np.zeros(self.num_envs)
+        servo, reached = _servo(self.config.waypoint)
+        target, grip = waypoint.Pose(targets[:, :3], targets[:, 3:7]), targets[:, 7]
+        limit = np.where(hold > 0, hold, self.config.waypoint.max_steps)
+        current = reference = self._eef()
+        active = moves & ~self._done
+        while active.any():
+            actions, reference = servo(current, target, grip, reference, hold > 0)
+            reward += self._tick(actions, active)
+            current = self._eef()
+            arrived = reached(current, target) & (hold == 0)
+            active &= ~self._done & ~arrived & (self._steps - before < limit)
+        return self._control(
+            EePoseControl,
+            reward,
+            np.zeros(self.num_envs, bool),
+            before,
+            converged=reached(current, target) & moves,
+            final_pose=np.concatenate(current, axis=1),
+            step_count=self._steps - before,
+            error=errors,
+        )
+
+    def _eef(self) -> waypoint.Pose:
+        """End-effector position and hand orientation, world frame, as of the last physics call."""
+        pos: Any = np.zeros((self.num_envs, 3))
+        quat: Any = np.zeros((self.num_envs, 4))
+        for group in self.physics.groups:
+            pos[group.slots] = group.site_xpos[:, group.scene.grip_site]
+            quat[group.slots] = group.xquat[:, group.scene.hand_body]
+        return waypoint.Pose(pos, quat)
+
+    # -- perception ----------------------------------------------------------------------------------------------------
+
+    def observe_egocentric(self) -> Egocentric:
+        """Proprioception of every slot; images come with a renderer, and ``rgb`` is None without one."""
+        self._check_live()
+        physics = self.physics
+        state = np.concatenate([physics.eef_pos, axis_angle(physics.eef_quat), physics.fingers], axis=1)
+        return Egocentric(state=state.astype(np.float32))
+
+    def observe_objects(self, points: str = "surface") -> Objects:
+        """Ground truth of every slot.
+
+        Args:
+            points: ``"surface"``, true surface points of the collision geometry (at least 200 a thing, always the same
+                ones); or ``"aabb"``, points on the faces of the box around it.
+
+        Raises:
+            LiberoError: another value.
+        """
+        self._check_live()
+        if points not in ("surface", "aabb"):
+            raise LiberoError(f"points={points!r}: expected 'surface' or 'aabb'")
+        snapshots: list[ObjectsSnapshot | None] = [None] * self.num_envs
+        errors = list(self._fault)
+        for group in self.physics.groups:
+            group.refresh_kinematics()
+            clouds = _Clouds.of(group.scene).world(group, points)
+            for row, slot in enumerate(group.slots):
+                if not errors[slot]:
+                    snapshots[slot] = self._snapshot(group, row, int(slot), clouds)
+        return Objects(
+            snapshot=tuple(snapshots), error=tuple(f"physics failed: {reason}" if reason else "" for reason in errors)
+        )
+
+    def _snapshot(
+        self, group: Group, row: int, slot: int, clouds: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    ) -> ObjectsSnapshot:
+        scene, problem = group.scene, self._tasks[int(self._placement.task[slot])].problem
+        named = {name: PointCloud(pos[row], normal[row]) for name, (pos, normal) in clouds.items()}
+        scenery = named.pop(_SCENERY)
+        everything = [*named.values(), scenery]
+        return ObjectsSnapshot(
+            names=tuple(scene.entities),
+            objects=named,
+            poses={name: _body_pose(group, row, entity.root_body) for name, entity in scene.entities.items()},
+            regions={name: _region_box(group, row, name) for name in scene.regions},
+            goal=tuple((predicate.name, *predicate.args) for predicate in problem.goal),
+            scene=PointCloud(
+                np.concatenate([cloud.points for cloud in everything]),
+                np.concatenate([cloud.normals for cloud in everything]),
+            ),
+            ee_pose=np.concatenate([group.site_xpos[row, scene.grip_site], group.xquat[row, scene.hand_body]]),
+            gripper=group.qpos[row, scene.finger_qpos].copy(),
+            workspace=scene.workspace_bounds,
+            targets=problem.obj_of_interest,
+            movable=tuple(entity.name for entity in scene.objects),
+        )
+
+    def evaluate(self) -> Metrics:
+        """The verdict of each slot as of its last executed tick."""
+        self._check_open()
+        return Metrics(
+            success=self._success.copy(),
+            num_steps=self._steps.copy(),
+            suite=self.suite,
+            task_id=self._placement.task.copy(),
+            cumulative_reward=self._reward.copy(),
+        )
+
+    def check_success(self) -> np.ndarray:
+        """Whether each slot's goal holds in its present state, bool [B]; unlike ``evaluate`` not tied to a tick."""
+        self._check_live()
+        for group in self.physics.groups:
+            group.refresh_all()
+        return self._judge()
+
+    # -- physics state -------------------------------------------------------------------------------------------------
+
+    @property
+    def physics(self) -> NativePhysics:
+        """The physics of the batch."""
+        if self._physics is None:
+            raise LiberoError("the environment is closed")
+        return self._physics
+
+    @property
+    def mj_models(self) -> tuple[mujoco.MjModel, ...]:
+        """The compiled models, one a scene; ``scene_index`` says which slot uses which."""
+        return tuple(group.scene.model for group in self.physics.groups)
+
+    @property
+    def scene_index(self) -> np.ndarray:
+        """Index into ``mj_models`` of each slot, int [B]."""
+        index = np.zeros(self.num_envs, int)
+        for number, group in enumerate(self.physics.groups):
+            index[group.slots] = number
+        return index
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The compiled model of a batch with a single scene.
+
+        Raises:
+            LiberoError: the batch has several scenes; use ``mj_models``.
+        """
+        if len(self.mj_models) != 1:
+            raise LiberoError(f"this batch has {len(self.mj_models)} scenes; use mj_models and scene_index")
+        return self.mj_models[0]
+
+    def state(self) -> State:
+        """Physics state of every slot, a copy."""
+        self._check_live()
+        groups = self.physics.groups
+        nq, nv = np.zeros(self.num_envs, int), np.zeros(self.num_envs, int)
+        qpos = np.zeros((self.num_envs, max(group.scene.model.nq for group in groups)))
+        qvel = np.zeros((self.num_envs, max(group.scene.model.nv for group in groups)))
+        time = np.zeros(self.num_envs)
+        for group in groups:
+            model, slots = group.scene.model, group.slots
+            nq[slots], nv[slots], time[slots] = model.nq, model.nv, group.time
+            qpos[slots, : model.nq], qvel[slots, : model.nv] = group.qpos, group.qvel
+        return State(qpos=qpos, qvel=qvel, time=time, nq=nq, nv=nv)
+
+    def set_state(self, state: State | None = None, *, qpos: Any = None, qvel: Any = None, time: Any = None) -> None:
+        """Overwrite the physics state of every slot; step counts, verdicts and the controller's memory stay.
+
+        Args:
+            state: what ``state()`` returned; or the arrays one by one, what is None stays:
+            qpos: [B, >= nq]. qvel: [B, >= nv]. time: seconds, [B].
+
+        Raises:
+            LiberoError: a wrong shape, or a number that is not finite.
+        """
+        self._check_live()
+        current = self.state()
+        chosen = state or State(
+            qpos=current.qpos if qpos is None else np.asarray(qpos, float),
+            qvel=current.qvel if qvel is None else np.asarray(qvel, float),
+            time=current.time if time is None else np.asarray(time, float),
+            nq=current.nq,
+            nv=current.nv,
+        )
+        for name in ("qpos", "qvel", "time"):
+            have, need = getattr(chosen, name).shape, getattr(current, name).shape
+            if len(have) != len(need) or have[0] != need[0] or have[1:] < need[1:]:
+                raise LiberoError(f"set_state: {name} has shape {have}; expected {need}")
+            bad = ~np.isfinite(getattr(chosen, name)).reshape(self.num_envs, -1).all(axis=1)
+            if bad.any():
+                raise LiberoError(f"set_state: {name} of slot {int(bad.argmax())} is not finite")
+        for group in self.physics.groups:
+            model, slots = group.scene.model, group.slots
+            qpos, qvel = chosen.qpos[slots, : model.nq], chosen.qvel[slots, : model.nv]
+            self.physics.write_state(group, qpos, qvel, chosen.time[slots])
+        self._quarantine(np.ones(self.num_envs, bool))
+
+    # -- helpers -------------------------------------------------------------------------------------------------------
+
+    @property
+    def _done(self) -> np.ndarray:
+        return self._terminated | self._truncated
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise LiberoError("the environment is closed")
+
+    def _check_live(self) -> None:
+        self._check_open()
+        if not self._live.all():
+            raise LiberoError("call reset() first: it makes the placed episodes live")
+
+
+_SCENERY = ""
+
+
+@dataclass(frozen=True)
+class _Clouds:
+    """Body-frame samples of everything in a scene."""
+
+    surface: Mapping[str, surface.BodyPoints]
+    corners: Mapping[str, surface.BodyPoints]
+
+    @staticmethod
+    @functools.lru_cache(maxsize=64)
+    def _cached(scene_id: int, scene: _ByIdentity) -> _Clouds:
+        names = tuple(scene.value.entities)
+        points = {name: surface.entity_points(scene.value, name) for name in names}
+        points[_SCENERY] = surface.scenery_points(scene.value)
+        return _Clouds(points, {name: surface.entity_corners(scene.value, name) for name in names})
+
+    @staticmethod
+    def of(scene: Scene) -> _Clouds:
+        return _Clouds._cached(id(scene), _ByIdentity(scene))
+
+    def world(self, group: Group, points: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        clouds = {name: cloud.world(group.xpos, group.xmat) for name, cloud in self.surface.items()}
+        if points == "aabb":
+            for name, corners in self.corners.items():
+                pos, _ = corners.world(group.xpos, group.xmat)
+                clouds[name] = surface.box_samples(pos.min(axis=1), pos.max(axis=1))
+        return clouds
+
+
+class _ByIdentity:
+    """Makes an unhashable scene a cache key: equal only to itself, and kept alive by the cache."""
+
+    def __init__(self, value: Scene) -> None:
+        self.value = value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByIdentity) and other.value is self.value
+
+
+def _body_pose(group: Group, row: int, body: str) -> np.ndarray:
+    index = group.scene.model.body(body).id
+    return np.concatenate([group.xpos[row, index], group.xquat[row, index]])
+
+
+def _region_box(group: Group, row: int, name: str) -> RegionBox:
+    model, region = group.scene.model, group.scene.regions[name]
+    site = model.site(name).id
+    axis = None
+    for joint in region.joints:
+        if model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_SLIDE:
+            axis = group.xmat[row, model.joint(joint).bodyid[0]].reshape(3, 3) @ model.joint(joint).axis
+    return RegionBox(
+        pos=group.site_xpos[row, site].copy(),
+        mat=group.site_xmat[row, site].reshape(3, 3).copy(),
+        half_extents=np.array(region.size),
+        parent=region.parent,
+        axis=axis,
+    )
+
+
+def axis_angle(quat: np.ndarray) -> np.ndarray:
+    """Rotation vectors [..., 3] of quaternions wxyz [..., 4], with the angle in [0, 2 pi), as LIBERO policies expect.
+
+    The convention is that of robosuite's ``quat2axisangle``: no sign is chosen, and a rotation of zero is zero.
+    """
+    w = np.clip(quat[..., :1], -1.0, 1.0)
+    norm = np.sqrt(1.0 - w * w)
+    small = np.isclose(norm, 0.0, rtol=1e-9, atol=0.0)
+    scale = np.where(small, 0.0, 2.0 * np.arccos(w) / np.where(small, 1.0, norm))
+    return quat[..., 1:] * scale
+
+
+def make(
+    suite: str,
+    *,
+    task: Any = None,
+    tasks: Any = None,
+    episodes: Any = None,
+    **options: Any,
+) -> LiberoEnv:
+    """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments."""
+    specs = list_tasks(suite)
+    if task is not None and tasks is not None:
+        raise LiberoError("give task or tasks, not both")
+    chosen = tasks if task is None else task
+    placement = placing.cross(
+        range(len(specs)) if chosen is None else chosen,
+        range(NUM_EPISODES) if episodes is None else episodes,
+        num_tasks=len(specs),
+        num_episodes=NUM_EPISODES,
+    )
+    return LiberoEnv(suite, placement, LiberoConfig(**options))
