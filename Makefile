@@ -1,0 +1,65 @@
+# Everything here starts from an empty clone: each target sets up what it needs, says so, and does it once.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+VENV ?= .venv
+# Any Python from 3.11 on; looked for when not given.
+PYTHON ?=
+# What `make eval` evaluates.
+EVAL_ARGS ?= --suite libero_object --policy pick_place --episodes 5
+# Test processes; each compiles its own JAX functions and takes about 1 GB.
+WORKERS ?= 2
+# More arguments for pytest, say TEST_ARGS="tests/test_cli.py -k doctor".
+TEST_ARGS ?=
+
+RUN := $(VENV)/bin
+PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+.PHONY: help setup eval test test-heavy lint format doctor dist-check clean distclean
+
+help: ## Show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(VENV)/.installed-dev ## Make .venv and install vecenv in it with everything for development
+
+eval: $(VENV)/.installed-eval ## Evaluate pick_place on libero_object: 10 tasks x 5 episodes, table and results folder
+	@echo "==> vecenv eval $(EVAL_ARGS)"
+	@$(RUN)/vecenv eval $(EVAL_ARGS)
+
+test: $(VENV)/.installed-dev ## Run the tests, all but those marked heavy
+	@echo "==> pytest, $(WORKERS) processes, without the tests marked heavy"
+	@$(PYTEST) -m "not heavy" $(TEST_ARGS)
+
+test-heavy: $(VENV)/.installed-dev ## Run the tests marked heavy (minutes of physics, or a peer simulator)
+	@echo "==> pytest, $(WORKERS) processes, the tests marked heavy"
+	@$(PYTEST) -m heavy $(TEST_ARGS)
+
+lint: $(VENV)/.installed-dev ## Check style, formatting and types: ruff, pyright
+	@echo "==> ruff check"
+	@$(RUN)/ruff check
+	@echo "==> ruff format --check"
+	@$(RUN)/ruff format --check
+	@echo "==> pyright"
+	@$(RUN)/pyright
+
+format: $(VENV)/.installed-dev ## Put the formatting right, and what ruff can mend by itself
+	@$(RUN)/ruff check --fix-only
+	@$(RUN)/ruff format
+
+doctor: $(VENV)/.installed-eval ## Show what this machine has and what is missing
+	@$(RUN)/vecenv doctor
+
+dist-check: $(VENV)/.installed-dev ## Build the wheel, install it in a throw-away venv and try it there
+	@scripts/dist_check.sh $(RUN)/python
+
+clean: ## Remove caches and build outputs; .venv and results/ stay
+	rm -rf build dist .pytest_cache .ruff_cache .hypothesis *.egg-info
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+distclean: clean ## Remove .venv as well
+	rm -rf $(VENV)
+
+# A stamp for each set of extras; made again when pyproject.toml changes.
+$(VENV)/.installed-%: pyproject.toml scripts/setup.sh
+	@PYTHON="$(PYTHON)" scripts/setup.sh $(VENV) $*

