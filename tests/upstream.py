@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 
 from vecenv.libero import suites
+from vecenv.libero.arenas import ARENAS
 from vecenv.libero.bddl import Predicate, Problem, SceneKey
 
 
@@ -146,3 +147,26 @@ def problem_of(peer: Any) -> dict[str, Any]:
 def contains(problem: Problem, name: str) -> bool:
     """Whether a problem declares an object or fixture of this name."""
     return any(instance.name == name for instance in (*problem.objects, *problem.fixtures))
+
+
+_TASK = """
+(define (problem {problem})
+  (:domain robosuite)
+  (:language put the bowl on the plate)
+  (:regions
+    (bowl_region (:target {workspace}) (:ranges ((-0.05 0.1 0.0 0.2))) (:yaw_rotation ((0.0 0.5))))
+    (goal_region (:target {workspace}) (:ranges ((0.1 -0.2 0.2 0.0))))
+    (top_region (:target wooden_cabinet_1)))
+  (:fixtures {workspace} - {table} wooden_cabinet_1 - {fixture})
+  (:objects bowl_1 - {category})
+  (:obj_of_interest bowl_1)
+  (:init (On bowl_1 {workspace}_bowl_region) (On wooden_cabinet_1 {workspace}_goal_region))
+  (:goal (And (On bowl_1 {workspace}_goal_region))))
+"""
+
+
+def task_text(problem: str, category: str = "akita_black_bowl", fixture: str = "wooden_cabinet") -> str:
+    """A small task that no suite holds: a bowl and a cabinet in the workspace of any problem class."""
+    arena = ARENAS.get(problem, ARENAS["libero_floor_manipulation"])
+    table = arena.workspace_category
+    return _TASK.format(problem=problem, workspace=arena.workspace, table=table, category=category, fixture=fixture)

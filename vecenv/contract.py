@@ -137,8 +137,8 @@ class PointCloud:
 class RegionBox:
     """A named place: a box with centre ``pos`` [3], rotation ``mat`` [3, 3] and ``half_extents`` [3], in metres.
 
-    ``parent`` is the object or fixture it belongs to, None for a place on the table or floor. ``axis`` is the axis along
-    which the part that carries it slides (a drawer's, unit vector [3]), None where nothing slides. World frame.
+    ``parent`` is the object or fixture it belongs to, None for a place on the table or floor. ``axis`` is the axis
+    along which the part that carries it slides (a drawer's, unit vector [3]), None where nothing slides. World frame.
     """
 
     pos: np.ndarray

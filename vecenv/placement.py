@@ -30,7 +30,7 @@ class Placement:
 
 def _ints(value: Any, what: str) -> list[int]:
     try:
-        items = list(value)
+        items: list[Any] = [value] if isinstance(value, Mapping) else list(value)
     except TypeError:
         items = [value]
     for item in items:

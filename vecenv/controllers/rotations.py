@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 
 def require_tail(name: str, array: jax.Array, tail: tuple[int, ...]) -> None:
@@ -35,8 +36,9 @@ def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     return total
 
 
-def safe_norm(v: jax.Array) -> jax.Array:
+def safe_norm(v: ArrayLike) -> jax.Array:
     """Euclidean length of vectors [..., n], with gradient 0 (not NaN) at the zero vector."""
+    v = jnp.asarray(v)
     squared = dot(v, v)
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
@@ -50,7 +52,7 @@ def matmul(a: jax.Array, b: jax.Array) -> jax.Array:
     return rows
 
 
-def quat_normalize(quat: jax.Array) -> tuple[jax.Array, jax.Array]:
+def quat_normalize(quat: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """Scale quaternions to unit length.
 
     Args:
@@ -74,8 +76,11 @@ def _identity_like(quat: jax.Array) -> jax.Array:
     return jnp.zeros_like(quat).at[..., 0].set(1)
 
 
-def quat_mul(a: jax.Array, b: jax.Array) -> jax.Array:
+def quat_mul(a: ArrayLike, b: ArrayLike) -> jax.Array:
     """Hamilton product of wxyz quaternions [..., 4]: the rotation b followed by a."""
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    require_tail("a", a, (4,))
+    require_tail("b", b, (4,))
     aw, ax, ay, az = (a[..., i] for i in range(4))
     bw, bx, by, bz = (b[..., i] for i in range(4))
     return jnp.stack(
@@ -89,12 +94,14 @@ def quat_mul(a: jax.Array, b: jax.Array) -> jax.Array:
     )
 
 
-def quat_conjugate(quat: jax.Array) -> jax.Array:
+def quat_conjugate(quat: ArrayLike) -> jax.Array:
     """Inverse rotation of unit wxyz quaternions [..., 4]."""
+    quat = jnp.asarray(quat)
+    require_tail("quat", quat, (4,))
     return jnp.concatenate([quat[..., :1], -quat[..., 1:]], axis=-1)
 
 
-def quat_to_mat(quat: jax.Array) -> jax.Array:
+def quat_to_mat(quat: ArrayLike) -> jax.Array:
     """Rotation matrices [..., 3, 3] of unit wxyz quaternions [..., 4]."""
     quat = jnp.asarray(quat)
     require_tail("quat", quat, (4,))
@@ -107,7 +114,7 @@ def quat_to_mat(quat: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def mat_to_quat(mat: jax.Array) -> jax.Array:
+def mat_to_quat(mat: ArrayLike) -> jax.Array:
     """Unit wxyz quaternions [..., 4] with w >= 0 of rotation matrices [..., 3, 3].
 
     Shepperd's method: four times the outer product q qᵀ is linear in the matrix; its row with the largest diagonal
@@ -128,7 +135,7 @@ def mat_to_quat(mat: jax.Array) -> jax.Array:
     return jnp.where(quat[..., :1] < 0, -quat, quat)
 
 
-def rotvec_to_quat(rotvec: jax.Array) -> jax.Array:
+def rotvec_to_quat(rotvec: ArrayLike) -> jax.Array:
     """Unit wxyz quaternions [..., 4] of rotation vectors [..., 3]."""
     rotvec = jnp.asarray(rotvec)
     require_tail("rotvec", rotvec, (3,))
@@ -139,7 +146,7 @@ def rotvec_to_quat(rotvec: jax.Array) -> jax.Array:
     return jnp.concatenate([jnp.cos(angle / 2), rotvec * scale], axis=-1)
 
 
-def quat_to_rotvec(quat: jax.Array) -> jax.Array:
+def quat_to_rotvec(quat: ArrayLike) -> jax.Array:
     """Rotation vectors [..., 3] of unit wxyz quaternions [..., 4], the shorter way round (angle at most pi).
 
     At exactly half a turn both ways are equally long and the quaternion's own axis is taken.
@@ -154,7 +161,7 @@ def quat_to_rotvec(quat: jax.Array) -> jax.Array:
     return quat[..., 1:] * jnp.where(moving, angle / jnp.where(moving, sine, 1), 2)
 
 
-def rotation_between(current: jax.Array, target: jax.Array) -> jax.Array:
+def rotation_between(current: ArrayLike, target: ArrayLike) -> jax.Array:
     """Rotation that takes ``current`` to ``target``, in the world frame.
 
     Args:

@@ -12,7 +12,7 @@ an array namespace, so NumPy and JAX give the same verdicts. Predicates are upst
 * ``In(a, region)``: a's origin lies within the axis-aligned box around the rotated half extents, 1 cm lower at the
   bottom.
 * ``Open`` holds when any joint is open, ``Close`` when all joints are closed; likewise ``TurnOn`` and ``TurnOff``.
-* ``Up(a)``: a's origin is at least 1 m above the world's origin.
+* ``Up(a)``: a's origin, or the region's centre, is at least 1 m above the world's origin.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from vecenv.libero.arenas import ARENAS
 from vecenv.libero.bddl import Predicate, Problem
 from vecenv.libero.scene import Entity, RegionSite, Scene, contact_sensor_name, zone_site
 
-TRUE, FALSE, UP, IN_REGION, ON_REGION, ON_OBJECT, ANY_JOINT, ALL_JOINTS = range(8)
+TRUE, FALSE, UP, UP_REGION, IN_REGION, ON_REGION, ON_OBJECT, ANY_JOINT, ALL_JOINTS = range(9)
 
 ON_TOP_RADIUS = 0.03
 UP_HEIGHT = 1.0
@@ -221,7 +221,8 @@ class _Context:
 
     def up(self) -> _Row:
         (name,) = self.args(1)
-        return _Row(kind=UP, body=self.body(name))
+        region = self.region(name)
+        return _Row(kind=UP, body=self.body(name)) if region is None else _Row(kind=UP_REGION, **self.place(region))
 
     def inside(self) -> _Row:
         name, container = self.args(2)
@@ -250,6 +251,8 @@ class _Context:
         joint_test: catalog.JointTest | None = getattr(catalog.articulation(owner.category), test)
         if joint_test is None:
             raise self.error(f"is not defined for a {owner.category}")
+        if not owner.fixture and region is None:
+            raise self.error("is defined for fixtures and for regions, not for movable objects")
         addresses = tuple(int(self.scene.model.joint(joint).qposadr[0]) for joint in names)
         return _Row(kind=kind, joints=addresses, test=joint_test)
 
@@ -303,6 +306,7 @@ def predicates(
     values = (
         (TRUE, xp.ones(table.kind.shape, bool)),
         (UP, pos[..., 2] >= UP_HEIGHT),
+        (UP_REGION, frame_pos[..., 2] >= UP_HEIGHT),
         (IN_REGION, _in_region(pos, frame_pos, frame_mat, table.size, xp)),
         (ON_REGION, _on_region(pos, frame_pos, frame_mat, table.size, xp) & touching),
         (ON_OBJECT, _on_object(pos, xpos[slot, table.reference], xp) & touching),

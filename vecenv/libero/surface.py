@@ -18,6 +18,9 @@ from vecenv.libero.scene import BASE_BODY, Scene
 POINTS_PER_ENTITY = 320
 MIN_POINTS = 200
 _INSIDE = 1e-4
+# Points drawn for each point asked for, at first and at most; those inside another geom are thrown away.
+_DRAWN_FIRST = 4
+_DRAWN_AT_MOST = 64
 _BOX_FACE_GRID = 7
 
 _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
@@ -103,34 +106,33 @@ def sample_geoms(
     """Spread about ``count`` points over the outer surface of geoms; each body is a union of its geoms."""
     geoms = list(geoms)
     rng = np.random.default_rng(0)
-    density = 4.0
+    areas = np.array([_area(model, g, plane_half_size) for g in geoms])
+    drawn = _DRAWN_FIRST * count
     while True:
-        parts = [_sample_outer(model, g, geoms, int(density * count), rng, plane_half_size) for g in geoms]
-        weights = np.concatenate([np.full(len(pos), area / max(drawn, 1)) for pos, _, area, drawn in parts])
-        if len(weights) >= count or density > 64:
+        counts = np.ceil(drawn * areas / areas.sum()).astype(int)
+        parts = [_sample_outer(model, g, geoms, n, rng, plane_half_size) for g, n in zip(geoms, counts, strict=True)]
+        pos = np.concatenate([part[0] for part in parts])
+        if len(pos) >= count or drawn > _DRAWN_AT_MOST * count:
             break
-        density *= 2
-    body = np.concatenate([np.full(len(part[0]), model.geom_bodyid[g]) for g, part in zip(geoms, parts, strict=True)])
-    pos = np.concatenate([part[0] for part in parts])
+        drawn *= 2
     normal = np.concatenate([part[1] for part in parts])
-    chosen = rng.choice(len(pos), min(count, len(pos)), replace=False, p=weights / weights.sum())
-    chosen.sort()
+    body = np.repeat(model.geom_bodyid[geoms], [len(part[0]) for part in parts])
+    chosen = np.sort(rng.choice(len(pos), min(count, len(pos)), replace=False))
     return BodyPoints(body[chosen], pos[chosen], normal[chosen])
 
 
 def _sample_outer(
     model: mujoco.MjModel, geom: int, geoms: list[int], count: int, rng: np.random.Generator, plane_half_size: float
-) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """Points of one geom not inside its siblings, body frame; with its area and how many were drawn."""
-    drawn = max(8, count // len(geoms))
-    local, normal, area = _sample_primitive(model, geom, drawn, rng, plane_half_size)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those of ``count`` points of a geom's surface that are not inside its siblings, body frame, and their normals."""
+    local, normal = _sample_primitive(model, geom, count, rng, plane_half_size)
     mat = _mat(model.geom_quat[geom])
     pos, normal = local @ mat.T + model.geom_pos[geom], normal @ mat.T
     outer = np.ones(len(pos), bool)
     for other in geoms:
         if other != geom and model.geom_bodyid[other] == model.geom_bodyid[geom]:
             outer &= ~_inside(model, other, pos)
-    return pos[outer], normal[outer], area, drawn
+    return pos[outer], normal[outer]
 
 
 def _inside(model: mujoco.MjModel, geom: int, pos: np.ndarray) -> np.ndarray:
@@ -149,40 +151,59 @@ def _inside(model: mujoco.MjModel, geom: int, pos: np.ndarray) -> np.ndarray:
     return np.zeros(len(p), bool)
 
 
+def _area(model: mujoco.MjModel, geom: int, plane_half_size: float) -> float:
+    """Area of a geom's surface, square metres."""
+    size, kind = model.geom_size[geom], model.geom_type[geom]
+    if kind == _BOX:
+        return float(8 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0]))
+    if kind == _PLANE:
+        return 4 * plane_half_size**2
+    if kind in (_SPHERE, _CAPSULE, _CYLINDER):
+        return sum(_round_areas(size[0], _half_length(model, geom), flat_ends=kind == _CYLINDER))
+    if kind == _MESH:
+        return float(np.linalg.norm(_face_normals(_mesh_corners(model, geom)), axis=1).sum() / 2)
+    raise ValueError(f"geom {model.geom(geom).name!r}: surface sampling does not know geom type {kind}")
+
+
+def _half_length(model: mujoco.MjModel, geom: int) -> float:
+    return 0.0 if model.geom_type[geom] == _SPHERE else float(model.geom_size[geom, 1])
+
+
 def _sample_primitive(
     model: mujoco.MjModel, geom: int, count: int, rng: np.random.Generator, plane_half_size: float
-) -> tuple[np.ndarray, np.ndarray, float]:
+) -> tuple[np.ndarray, np.ndarray]:
     size, kind = model.geom_size[geom], model.geom_type[geom]
     if kind == _BOX:
         return _sample_box(size, count, rng)
     if kind == _PLANE:
         flat = rng.uniform(-plane_half_size, plane_half_size, (count, 3)) * [1, 1, 0]
-        return flat, np.tile([0.0, 0.0, 1.0], (count, 1)), (2 * plane_half_size) ** 2
-    if kind in (_SPHERE, _CAPSULE, _CYLINDER):
-        half = 0.0 if kind == _SPHERE else size[1]
-        return _sample_round(size[0], half, count, rng, flat_ends=kind == _CYLINDER)
+        return flat, np.tile([0.0, 0.0, 1.0], (count, 1))
     if kind == _MESH:
-        return _sample_mesh(model, int(model.geom_dataid[geom]), count, rng)
-    raise ValueError(f"geom {model.geom(geom).name!r}: surface sampling does not know geom type {kind}")
+        return _sample_mesh(_mesh_corners(model, geom), count, rng)
+    return _sample_round(size[0], _half_length(model, geom), count, rng, flat_ends=kind == _CYLINDER)
 
 
-def _sample_box(size: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, float]:
-    areas = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]]) * 4
+def _sample_box(size: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    areas = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
     axis = rng.choice(3, count, p=areas / areas.sum())
     side = rng.choice([-1.0, 1.0], count)
     pos = rng.uniform(-1, 1, (count, 3))
     pos[np.arange(count), axis] = side
     normal = np.zeros((count, 3))
     normal[np.arange(count), axis] = side
-    return pos * size, normal, float(2 * areas.sum())
+    return pos * size, normal
+
+
+def _round_areas(radius: float, half: float, *, flat_ends: bool) -> tuple[float, float]:
+    """Areas of the side and of both ends of a sphere, capsule or cylinder."""
+    return 4 * np.pi * radius * half, 2 * np.pi * radius**2 * (1 if flat_ends else 2)
 
 
 def _sample_round(
     radius: float, half: float, count: int, rng: np.random.Generator, *, flat_ends: bool
-) -> tuple[np.ndarray, np.ndarray, float]:
+) -> tuple[np.ndarray, np.ndarray]:
     """A sphere, capsule or cylinder about z."""
-    side_area = 4 * np.pi * radius * half
-    end_area = 2 * np.pi * radius**2 * (1 if flat_ends else 2)
+    side_area, end_area = _round_areas(radius, half, flat_ends=flat_ends)
     on_side = rng.uniform(size=count) < side_area / (side_area + end_area)
     angle = rng.uniform(0, 2 * np.pi, count)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], 1)
@@ -197,21 +218,29 @@ def _sample_round(
         end_pos = radius * end_normal + (sign * half)[:, None] * z_axis
     side_pos = radius * ring + (rng.uniform(-half, half, count) if half else np.zeros(count))[:, None] * z_axis
     pick = on_side[:, None]
-    return np.where(pick, side_pos, end_pos), np.where(pick, ring, end_normal), float(side_area + end_area)
+    return np.where(pick, side_pos, end_pos), np.where(pick, ring, end_normal)
 
 
-def _sample_mesh(
-    model: mujoco.MjModel, mesh: int, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, float]:
+def _mesh_corners(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Corners of the triangles of a geom's mesh, [n, 3, 3]."""
+    mesh = model.geom_dataid[geom]
     vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
     vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]].astype(float)
-    corners = vertices[model.mesh_face[face : face + model.mesh_facenum[mesh]]]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1) / 2
-    chosen = rng.choice(len(corners), count, p=area / area.sum())
+    return vertices[model.mesh_face[face : face + model.mesh_facenum[mesh]]]
+
+
+def _face_normals(corners: np.ndarray) -> np.ndarray:
+    """Normals of triangles, twice as long as their area, [n, 3]."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _sample_mesh(corners: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    normal = _face_normals(corners)
+    length = np.linalg.norm(normal, axis=1)
+    chosen = rng.choice(len(corners), count, p=length / length.sum())
     u = np.sort(rng.uniform(size=(count, 2)), axis=1)
     weights = np.stack([u[:, 0], u[:, 1] - u[:, 0], 1 - u[:, 1]], 1)
-    return (weights[:, :, None] * corners[chosen]).sum(1), normal[chosen] / (2 * area[chosen, None]), float(area.sum())
+    return (weights[:, :, None] * corners[chosen]).sum(1), normal[chosen] / length[chosen, None]
 
 
 def _subtree_geoms(model: mujoco.MjModel, body: str) -> list[int]:
