@@ -13,14 +13,15 @@ import vecenv
 from vecenv.actions import ActionError
 from vecenv.contract import BatchEnv
 from vecenv.libero import scene as scene_module
-from vecenv.libero.env import LiberoEnv, LiberoError, _compiled
+from vecenv.libero import sources
+from vecenv.libero.env import LiberoEnv, LiberoError
 from vecenv.placement import PlacementError
 
 STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
 
 def make(suite: str = "libero_object", **options: Any) -> LiberoEnv:
-    options = {"task": 1, "episodes": range(3), "settle_steps": 0, **options}
+    options = {"task": 1, "episodes": range(3), "start": "raw", "settle_steps": 0, **options}
     if "tasks" in options:
         del options["task"]
     env = vecenv.make(suite, **options)
@@ -307,13 +308,13 @@ class TestFaults:
     def test_exhausted_memory_is_a_fault(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a log file where the process stands.
         monkeypatch.setattr(scene_module, "ARENA_MEMORY", "230K")
-        _compiled.cache_clear()
+        sources.compiled.cache_clear()
         try:
             env = make()
             env.reset()
             control = env.step_continuous(still(env))
         finally:
-            _compiled.cache_clear()
+            sources.compiled.cache_clear()
         assert control.truncated.all()
         assert control.info["fault"] == ("constraint memory exhausted",) * 3
 

@@ -62,7 +62,7 @@ def pair(suite: str, task: int, episode: int) -> tuple[Any, LiberoEnv]:
     with upstream.silence():
         peer.reset()
     peer.set_init_state(spec.init_states()[episode])
-    env = vecenv.make(suite, task=task, episodes=[episode], fixtures=fixtures_of(peer), settle_steps=0)
+    env = vecenv.make(suite, task=task, episodes=[episode], fixtures=fixtures_of(peer), start="raw", settle_steps=0)
     assert isinstance(env, LiberoEnv)
     env.reset()
     return peer, env

@@ -54,6 +54,9 @@ _FAULTS = {
     mujoco.mjtWarning.mjWARN_BADCTRL: "non-finite control",
 }
 
+# Gripper targets after a quarter of a second of the action -1.
+_OPEN = (1.0, -1.0)
+
 _FIELD = osc.packed_slices()
 _Rows: TypeAlias = np.ndarray | None
 
@@ -68,6 +71,9 @@ class Start:
         bodies: ids of the bodies whose poses are given, [F].
         body_pos: their positions in metres, world frame, [n, F, 3].
         body_quat: their orientations wxyz, [n, F, 4].
+        time: simulated seconds the starts have run for.
+        settled: the starts have already been stepped with an idle arm and an opening gripper, so the controller sees
+            them as they are; otherwise it still remembers the pose of the reset.
     """
 
     qpos: np.ndarray
@@ -75,6 +81,8 @@ class Start:
     bodies: np.ndarray
     body_pos: np.ndarray
     body_quat: np.ndarray
+    time: float = 0.0
+    settled: bool = False
 
 
 class Group:
@@ -104,7 +112,7 @@ class Group:
         """Put the simulations ``rows`` into their start states."""
         self.batch.reset(rows, stage=_NOTHING)
         self.batch.warning[rows] = 0
-        self.qpos[rows], self.qvel[rows] = start.qpos, start.qvel
+        self.qpos[rows], self.qvel[rows], self.time[rows] = start.qpos, start.qvel, start.time
         if len(start.bodies):
             if self._body_pos is None or self._body_quat is None:
                 self._body_pos, self._body_quat = self.batch.expand("body_pos"), self.batch.expand("body_quat")
@@ -211,8 +219,10 @@ class NativePhysics:
             self.fault[slot] = ""
         self._guarded(group, lambda: group.place(rows, start))
         placed = np.isin(self._order, slots)
-        self._fresh |= placed
+        self._fresh[placed] = not start.settled
         self._memory = self._substeps.rearm(self._memory, placed)
+        if start.settled:
+            self._memory = _open_grippers(self._memory, placed)
         self._observe_pose(group, rows)
         self._observe_fingers(group, rows)
 
@@ -308,6 +318,12 @@ class NativePhysics:
 def _controller() -> osc.Substeps:
     """The compiled controller, shared so that each batch size compiles once a process."""
     return osc.compile_substeps()
+
+
+def _open_grippers(memory: osc.ControlState, mask: np.ndarray) -> osc.ControlState:
+    """The controllers with the gripper targets of the slots in the mask, bool [B], all the way open."""
+    with jax.enable_x64(True):
+        return memory._replace(gripper=jnp.where(mask[:, None], jnp.array(_OPEN), memory.gripper))
 
 
 def _choose_goals(mask: np.ndarray, goal: osc.OscGoal, other: osc.OscGoal) -> osc.OscGoal:
