@@ -3,6 +3,8 @@
 Both sides run under the installed MuJoCo from the stored start (no settling in advance). Actions are piecewise constant
 at random, some without rotation, with gripper flips. A row is a task: the largest difference of joint positions before
 the robot's first contact with anything and after it, of the 8-D proprioception, and whether all verdicts agreed.
+Where contact amplifies rounding beyond 1e-5, a last column says how far upstream diverges from itself when one joint
+starts 1e-15 rad away.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ from vecenv.libero.suites import TaskSpec
 
 TICKS = 60
 SETTLE = 10
+# Above this, upstream is run against itself from a start 1e-15 rad away, to tell chaos from error.
+BOUND = 1e-5
 
 
 def random_actions(seed: int, ticks: int) -> np.ndarray:
@@ -94,6 +98,30 @@ def compare(spec: TaskSpec, episode: int) -> dict[str, Any]:
     }
 
 
+def sensitivity(spec: TaskSpec, episode: int) -> float:
+    """How far upstream strays from itself when one arm joint starts 1e-15 rad away: largest |dq| of seven tries."""
+    exact = _upstream_states(spec, episode, np.zeros(7))
+    return max(float(np.abs(_upstream_states(spec, episode, row) - exact).max()) for row in 1e-15 * np.eye(7))
+
+
+def _upstream_states(spec: TaskSpec, episode: int, nudge: np.ndarray) -> np.ndarray:
+    """Joint positions after each tick, [TICKS, nq], from a start whose arm is moved by ``nudge`` [7]."""
+    import upstream
+
+    peer = upstream.bare_peer(spec.bddl_path)
+    peer.seed(episode)
+    with upstream.silence():
+        peer.reset()
+    start = spec.init_states()[episode].copy()
+    start[1:8] += nudge
+    peer.set_init_state(start)
+    rows = []
+    for action in random_actions(episode, TICKS):
+        peer.step(action)
+        rows.append(upstream.data_of(peer).qpos.copy())
+    return np.array(rows)
+
+
 def main() -> None:
     """Compare one task of every scene, and two of those that several tasks share."""
     import upstream
@@ -105,6 +133,7 @@ def main() -> None:
     rows = []
     for number, spec in enumerate(specs):
         rows.append(compare(spec, episode=number % 50))
+        rows[-1]["upstream nudged 1e-15"] = sensitivity(spec, number % 50) if rows[-1]["max |dq| after"] > BOUND else ""
         print(rows[-1], flush=True)
     report(
         "trajectories",

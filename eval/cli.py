@@ -1,12 +1,15 @@
-"""``vecenv eval``: the harness on the command line.
+"""``vecenv eval`` and ``vecenv replay``: the harness on the command line.
 
-Flags come in; a progress bar, a table with Wilson 95 % intervals and the path of the results folder come out. The exit
-status is 0 when every episode has a verdict, 1 when some have none, 2 when the arguments make no sense and 130 after
-Ctrl-C (what was computed is kept, and the command that goes on with it is printed).
+For ``eval``, flags come in; a progress bar, a table with Wilson 95 % intervals and the path of the results folder come
+out. The exit status is 0 when every episode has a verdict, 1 when some have none, 2 when the arguments make no sense
+and 130 after Ctrl-C (what was computed is kept, and the command that goes on with it is printed). For ``replay``, files
+come in and a table goes out; the exit status is 0 when every verdict agrees, 1 when one does not or a demonstration
+cannot be replayed, and 2 when the arguments make no sense.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -16,11 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from vecenv.cli import fail
+from vecenv.cli import fail, unknown
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from eval.replay import ReplayReport
     from eval.runner import EvalResult, Evaluation, Progress
     from eval.store import ResultStore
 
@@ -52,6 +56,8 @@ def eval_command(
     resume: Path | None = typer.Option(
         None, help="Results folder to go on with; it keeps its settings.", show_default="none"
     ),
+    record: bool = typer.Option(False, "--record", help="Keep the executed actions, for `vecenv replay`."),
+    record_states: bool = typer.Option(False, "--record-states", help="Keep the states too; implies --record."),
     fail_fast: bool = typer.Option(False, "--fail-fast", help="Stop at the first batch that raises."),
     quiet: bool = typer.Option(False, "--quiet", help="Print the path of the results folder and nothing else."),
 ) -> None:
@@ -68,10 +74,68 @@ def eval_command(
         "env_args": _pairs("--env-arg", env_arg),
     }
     how = {"num_envs": num_envs, "num_threads": num_threads, "fail_fast": fail_fast}
+    how |= {"record": record or None, "record_states": record_states or None}
     sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
     with _user_errors():
         evaluation, store = _resume(resume, {**asked, "out": out}, how) if resume else _start({**asked, **how}, out)
     raise typer.Exit(_run(evaluation, store, quiet))
+
+
+def replay_command(
+    files: list[Path] = typer.Argument(
+        ..., help="Demonstrations in LIBERO's HDF5 layout, or folders of them, such as a results folder."
+    ),
+    suite: str | None = typer.Option(None, help="What the files demonstrate.", show_default="what they say"),
+    task: int | None = typer.Option(None, min=0, help="Task of --suite.", show_default="what they say"),
+    backend: str | None = typer.Option(None, help="Physics backend.", show_default="the one on record"),
+    num_envs: int = typer.Option(256, min=1, help="Most demonstrations that run at once."),
+    num_threads: int | None = typer.Option(None, min=1, help="Threads of the physics.", show_default="the backend's"),
+    out: Path | None = typer.Option(None, help="JSON file to write the outcomes to.", show_default="none"),
+) -> None:
+    """Execute recorded actions again and compare the verdicts."""
+    from rich.console import Console
+
+    from eval.replay import ReplayConfig, ReplayError, find_files, read_files, replay
+
+    _check_task(suite, task)
+    if out and not out.absolute().parent.is_dir():
+        fail(f"--out {out}: there is no folder {out.absolute().parent}")
+    try:
+        demos, unreadable = read_files(find_files(files), suite=suite, task=task)
+    except ReplayError as error:
+        fail(str(error))
+    console = Console()
+    config = ReplayConfig(backend=backend, num_envs=num_envs, num_threads=num_threads)
+    report = replay(demos, config, on_batch=lambda text: console.print(text, highlight=False))
+    report = dataclasses.replace(report, problems=(*unreadable, *report.problems))
+    _print_replay(console, report)
+    if out:
+        out.write_text(json.dumps(report.to_dict(), indent=2) + "\n")
+    raise typer.Exit(0 if report.ok else 1)
+
+
+def _check_task(suite: str | None, task: int | None) -> None:
+    import vecenv
+
+    if suite is None:
+        if task is not None:
+            fail("--task needs --suite")
+        return
+    if suite not in vecenv.list_suites():
+        fail(unknown("suite", suite, vecenv.list_suites()))
+    count = len(vecenv.list_tasks(suite))
+    if task is not None and task >= count:
+        fail(f"--task {task}: {suite} has tasks 0 to {count - 1}")
+
+
+def _print_replay(console: Console, report: ReplayReport) -> None:
+    from eval.replay import closing_line, table
+
+    if report.outcomes:
+        console.print(table(report))
+    for problem in report.problems:
+        console.print(f"error: {problem}", style="red", markup=False, highlight=False, soft_wrap=True)
+    console.print(closing_line(report), highlight=False, soft_wrap=True)
 
 
 def _start(arguments: dict[str, Any], out: Path | None) -> tuple[Evaluation, ResultStore]:

@@ -13,10 +13,11 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from eval.store import CONFIG, Record, ResultStore, StoreError
 from vecenv.cli import unknown
 from vecenv.contract import BatchEnv, Control, Metrics, ResetInfo
 
+# Called with which slots have just finished, bool [B], with the verdicts, bool [B], and with the faults, B strings.
+_Finish: TypeAlias = Callable[[np.ndarray, np.ndarray, Sequence[str]], None]
 # Calls of a policy in a row that may leave every live slot where it was, before it counts as stuck.
 MAX_IDLE_CALLS = 100
 
@@ -56,6 +59,8 @@ class EvalConfig:
         seed: seed of the environment, and of the policy if it takes one.
         env_args: further keyword arguments of ``vecenv.make``.
         fail_fast: stop at the first batch that raises.
+        record: keep what is executed in ``demos/``, for ``vecenv replay``.
+        record_states: keep the physics state before every tick too (implies ``record``).
     """
 
     suite: str
@@ -70,6 +75,8 @@ class EvalConfig:
     seed: int = 0
     env_args: Mapping[str, Any] = field(default_factory=dict)
     fail_fast: bool = False
+    record: bool = False
+    record_states: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,15 +352,43 @@ class _Run:
         started = time.perf_counter()
         env, info = self._place(batch)
         placed = _Placed(number, _slots(info, batch), info.instruction, time.perf_counter() - started)
+        with self._recording(env, placed) as finish:
+            self._drive(env, info, placed, finish)
+
+    def _drive(self, env: BatchEnv, info: ResetInfo, placed: _Placed, finish: _Finish) -> None:
+        """Let the policy act until every slot has finished."""
         started, before = time.perf_counter(), (self._steps, self._seconds)
         self.policy.reset(env, info)
         for control, finished in drive(env, self.policy):
             wall_s = time.perf_counter() - started
             if finished.any():
                 metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
+                finish(finished, metrics.success, control.info["fault"])
                 self._write([self._verdict(placed, i, metrics, control, wall_s) for i in slots])
             self._steps, self._seconds = before[0] + int(control.step_index.sum()), before[1] + wall_s
-            self._report(number)
+            self._report(placed.batch)
+
+    @contextmanager
+    def _recording(self, env: BatchEnv, placed: _Placed) -> Iterator[_Finish]:
+        """Record the batch when asked to; gives what to call with the slots that finish."""
+        if not (self.config.record or self.config.record_states):
+            yield lambda finished, success, faults: None
+            return
+        from eval.demos import make_options, write_demos
+        from eval.record import Recorder
+
+        options = make_options(self.simulator.make, **_make_arguments(self.config))
+        episodes = [slot.episode for slot in placed.slots]
+        recorder = Recorder(env, episodes, options, states=self.config.record_states)
+        try:
+            with recorder.listening():
+                yield recorder.finish
+        finally:  # also of a batch that raises: what has a verdict is not run again
+            recordings = recorder.recordings()
+            for key in dict.fromkeys((slot.suite, slot.task) for slot in placed.slots):
+                chosen = [r for i, r in recordings.items() if (placed.slots[i].suite, placed.slots[i].task) == key]
+                if chosen:
+                    write_demos(self.store.demos_path(*key), *key, self.suite.instructions[key[1]], chosen)
 
     def _verdict(self, placed: _Placed, slot: int, metrics: Metrics, control: Control, wall_s: float) -> Record:
         """The record of a slot that has just finished."""

@@ -2,7 +2,8 @@
 
 A folder holds ``config.json`` (what was asked, versions, machine, commit), ``episodes.jsonl`` (append-only, one
 :class:`Record` a line, synced to disk), ``errors.log`` (tracebacks of batches that failed), and at the end
-``summary.json`` and ``report.md``. Reading tolerates a last line that a crash cut off.
+``summary.json`` and ``report.md``. ``demos/`` holds what was executed, where that was asked for (``eval.demos``).
+Reading tolerates a last line that a crash cut off.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 from eval.episodes import Episode
 
 CONFIG, EPISODES, ERRORS, SUMMARY, REPORT = "config.json", "episodes.jsonl", "errors.log", "summary.json", "report.md"
+DEMOS = "demos"
 
 
 class StoreError(RuntimeError):
@@ -122,6 +124,10 @@ class ResultStore:
         text = "".join(json.dumps(_finite(asdict(record))) + "\n" for record in records)
         _append(self.folder / EPISODES, text)
 
+    def demos_path(self, suite: str, task: int) -> Path:
+        """Where the recorded episodes of a task go: ``demos/{suite}_{task}.hdf5``."""
+        return self.folder / DEMOS / f"{_file_name(suite)}_{task}.hdf5"
+
     def log_error(self, text: str) -> None:
         """Add a traceback to ``errors.log``."""
         _append(self.folder / ERRORS, text.rstrip() + "\n\n")
@@ -164,12 +170,16 @@ class ResultStore:
 def default_folder(root: Path, suite: str, policy: str, now: datetime | None = None) -> Path:
     """``root/<UTC time>_<suite>_<policy>``, with a counter when that name is taken."""
     stamp = (now or datetime.now(UTC)).strftime("%Y%m%dT%H%M%SZ")
-    name = "_".join([stamp, *(re.sub(r"[^\w.-]+", "-", part) for part in (suite, policy))])
+    name = "_".join([stamp, *map(_file_name, (suite, policy))])
     folder, count = root / name, 1
     while folder.exists():
         count += 1
         folder = root / f"{name}-{count}"
     return folder
+
+
+def _file_name(text: str) -> str:
+    return re.sub(r"[^\w.-]+", "-", text)
 
 
 def _parse(line: str, where: str) -> Record:

@@ -8,6 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from vecenv.contract import BatchEnv
     from vecenv.libero.suites import TaskSpec
 
@@ -24,11 +26,12 @@ def make(
     backend: str = "native",
     geometry: str = "exact",
     fixtures: Any = "center",
-    start: str = "raw",
+    start: str = "settled",
     settle_steps: int = 10,
     max_steps: int = 2500,
     seed: int = 0,
     num_threads: int | None = None,
+    scenes: str | Path | None = None,
 ) -> BatchEnv:
     """A batch of episodes: every one of ``episodes`` of every one of ``tasks``, task by task, one a slot.
 
@@ -41,11 +44,14 @@ def make(
         geometry: ``"exact"``: the collision geometry of upstream.
         fixtures: where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"`` from it
             (a function of seed, suite, task and episode), or name -> (pos [3] or [B, 3], quat wxyz [4] or [B, 4]).
-        start: ``"raw"``: the stored init states.
-        settle_steps: control ticks without motion, gripper opening, before an episode begins.
+        start: ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them (fixtures at the centre);
+            ``"raw"``: init states as stored, followed by ``settle_steps``.
+        settle_steps: for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
         max_steps: step budget in control ticks (20 a second).
         seed: see ``fixtures``.
         num_threads: C threads; None for one a core.
+        scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and no
+            LIBERO or robosuite files are needed. Otherwise from the installed packages.
 
     Raises:
         KeyError, ValueError, RuntimeError: subclasses that name the suite, task, option or asset that is wrong.
@@ -65,6 +71,7 @@ def make(
         max_steps=max_steps,
         seed=seed,
         num_threads=num_threads,
+        scenes=scenes,
     )
 
 

@@ -1,4 +1,4 @@
-"""The ``vecenv`` command: ``doctor`` and ``list`` live here, the rest is mounted from the packages that own it.
+"""The ``vecenv`` command: ``doctor``, ``list`` and ``compile`` live here, other packages mount theirs.
 
 Arguments come in, text and an exit status go out: 0 done, 1 something is wrong with the machine or the run, 2 the
 arguments were wrong. Commands of other packages are found through the entry-point group ``vecenv.commands``, so this
@@ -8,10 +8,12 @@ package needs no import of theirs. Nothing heavy is imported before a command ru
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 import importlib.metadata
 import json
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
@@ -40,6 +42,7 @@ def build_app(plugins: Iterable[importlib.metadata.EntryPoint] | None = None) ->
     app.callback()(_root)
     app.command("doctor")(doctor_command)
     app.command("list")(list_command)
+    app.command("compile")(compile_command)
     for plugin in importlib.metadata.entry_points(group=COMMAND_GROUP) if plugins is None else plugins:
         _mount(app, plugin)
     return app
@@ -80,6 +83,37 @@ def list_command(
         typer.echo(json.dumps(rows, indent=2))
     else:
         _print_rows(rows)
+
+
+def compile_command(
+    out: Path = typer.Option(..., "--out", metavar="DIR", help="Folder to write; make(..., scenes=DIR) reads it."),
+    suite: list[str] = typer.Option([], "--suite", help="A suite to export; may be given again. All by default."),
+) -> None:
+    """Export suites into one folder that needs no LIBERO or robosuite files: tasks, starts and compiled scenes."""
+    from rich.console import Console
+    from rich.progress import track
+
+    import vecenv
+    from vecenv.libero.bddl import BDDLError
+    from vecenv.libero.export import ExportError, export
+    from vecenv.libero.scene import SceneError
+    from vecenv.libero.settled import SettledStartsError
+    from vecenv.libero.suites import TaskDataError
+
+    for name in suite:
+        if name not in vecenv.list_suites():
+            fail(unknown("suite", name, vecenv.list_suites()))
+    console = Console(stderr=True)
+    try:
+        done = export(
+            out, suite or None, track=functools.partial(track, console=console, disable=not console.is_terminal)
+        )
+    except ExportError as error:
+        fail(str(error))
+    except (BDDLError, SceneError, SettledStartsError, TaskDataError, OSError) as error:
+        fail(str(error), code=1)
+    counts = f"suites: {done.suites}, tasks: {done.tasks}, scenes: {done.scenes}"
+    typer.echo(f"{counts}, {done.size / 1e6:.0f} MB in {done.folder}")
 
 
 def unknown(what: str, given: str, known: Sequence[str]) -> str:

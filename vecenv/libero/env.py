@@ -8,8 +8,10 @@ their start states, goals and instructions, which are data. Read ``vecenv/contra
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
@@ -34,9 +36,12 @@ from vecenv.contract import (
 from vecenv.controllers import waypoint
 from vecenv.libero import fixtures as fixture_poses
 from vecenv.libero import goals, surface
+from vecenv.libero import settled as settled_starts
 from vecenv.libero.bddl import Problem
-from vecenv.libero.scene import Scene, compile_scene
-from vecenv.libero.suites import NUM_EPISODES, TaskSpec, list_tasks
+from vecenv.libero.export import exported_tasks
+from vecenv.libero.scene import Scene
+from vecenv.libero.sources import Task, installed_tasks
+from vecenv.libero.suites import NUM_EPISODES
 from vecenv.physics.native import Group, NativePhysics, Start
 
 # What LIBERO evaluations send while objects settle after a reset: no motion, gripper open.
@@ -57,8 +62,10 @@ class LiberoConfig:
         geometry: ``"exact"``, upstream's collision geoms.
         fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), or name -> (pos [3] or [B, 3] in
             metres, quat wxyz [4] or [B, 4]), world frame.
-        start: ``"raw"``, the stored init states followed by ``settle_steps``.
-        settle_steps: control ticks with no motion and an open gripper before an episode begins; they do not count.
+        start: ``"settled"``, the stored init states after ten idle ticks under MuJoCo 3.3.0, shipped with the package,
+            with fixtures at the centre; or ``"raw"``, the stored init states followed by ``settle_steps``.
+        settle_steps: for ``start="raw"``: control ticks with no motion and an opening gripper before an episode begins;
+            they do not count.
         max_steps: step budget of an episode in control ticks.
         seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode.
         num_threads: C threads; None for one a core.
@@ -68,7 +75,7 @@ class LiberoConfig:
     backend: str = "native"
     geometry: str = "exact"
     fixtures: str | Mapping[str, Any] = "center"
-    start: str = "raw"
+    start: str = "settled"
     settle_steps: int = 10
     max_steps: int = MAX_STEPS
     seed: int = 0
@@ -76,20 +83,20 @@ class LiberoConfig:
     waypoint: waypoint.WaypointConfig = field(default_factory=waypoint.WaypointConfig)
 
     def __post_init__(self) -> None:
-        for name, allowed in (("backend", ("native",)), ("geometry", ("exact",)), ("start", ("raw",))):
+        for name, allowed in (("backend", ("native",)), ("geometry", ("exact",)), ("start", ("settled", "raw"))):
             if getattr(self, name) not in allowed:
                 raise LiberoError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
+        if self.start == "settled" and self.fixtures != "center":
+            raise LiberoError(
+                "fixtures other than 'center' need start='raw': what lies on fixtures settled at the centre"
+            )
         if self.settle_steps < 0 or self.max_steps < 1:
             raise LiberoError(f"settle_steps={self.settle_steps}, max_steps={self.max_steps}: need >= 0 and >= 1")
         if self.num_threads is not None and self.num_threads < 1:
             raise LiberoError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
 
 
-@functools.lru_cache(maxsize=64)
-def _compiled(problem: Problem, pairs: tuple[tuple[str, str], ...]) -> Scene:
-    return compile_scene(problem, contact_pairs=pairs)
-
-
+Watcher: TypeAlias = Callable[[np.ndarray, np.ndarray], None]
 _Servo: TypeAlias = Callable[..., tuple[np.ndarray, waypoint.Pose]]
 
 
@@ -122,7 +129,7 @@ def _servo(config: waypoint.WaypointConfig) -> tuple[_Servo, Callable[..., np.nd
 class _TaskData:
     """What one task adds to its scene."""
 
-    spec: TaskSpec
+    source: Task
     problem: Problem
     scene: int
 
@@ -132,6 +139,7 @@ class LiberoEnv:
 
     Args:
         suite: one of ``vecenv.list_suites()``.
+        tasks: the tasks of the suite, installed or exported.
         placement: task and episode of each slot.
         config: options.
 
@@ -139,12 +147,13 @@ class LiberoEnv:
         LiberoError, SceneError, GoalError, FixtureError, TaskDataError: something the options ask for does not exist.
     """
 
-    def __init__(self, suite: str, placement: placing.Placement, config: LiberoConfig) -> None:
+    def __init__(self, suite: str, tasks: Sequence[Task], placement: placing.Placement, config: LiberoConfig) -> None:
         self.suite, self.config = suite, config
         self.num_envs = len(placement)
-        self._specs = list_tasks(suite)
+        self._sources = tasks
         self._closed = False
         self._physics: NativePhysics | None = None
+        self._watchers: list[Watcher] = []
         self._place(placement)
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
@@ -160,7 +169,7 @@ class LiberoEnv:
             PlacementError: an index that does not exist, or a wrong number of them.
         """
         self._check_open()
-        counts = {"num_tasks": len(self._specs), "num_episodes": NUM_EPISODES}
+        counts = {"num_tasks": len(self._sources), "num_episodes": NUM_EPISODES}
         self._place(placing.each(tasks, episodes, self._placement, **counts))
 
     def _place(self, placement: placing.Placement) -> None:
@@ -178,15 +187,15 @@ class LiberoEnv:
     def _build(self) -> None:
         """Scenes, physics and goal tables for the current placement; what still fits is kept."""
         indices = np.unique(self._placement.task)
-        problems = {int(i): self._specs[i].problem() for i in indices}
+        problems = {int(i): self._sources[i].problem() for i in indices}
         keys = list(dict.fromkeys(problem.scene_key() for problem in problems.values()))
         scenes = []
         for key in keys:
-            sharing = [problem for problem in problems.values() if problem.scene_key() == key]
-            scenes.append(_compiled(sharing[0], goals.contact_pairs(sharing)))
+            sharing = {i: problem for i, problem in problems.items() if problem.scene_key() == key}
+            scenes.append(self._sources[min(sharing)].scene(goals.contact_pairs(sharing.values())))
         fixture_poses.check_names(self.config.fixtures, scenes)
         self._tasks = {
-            i: _TaskData(self._specs[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
+            i: _TaskData(self._sources[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
         }
         scene_of_slot = np.array([self._tasks[int(task)].scene for task in self._placement.task])
         if self._physics is None or not self._physics.serves(scenes, scene_of_slot):
@@ -211,7 +220,7 @@ class LiberoEnv:
         if stale.any():
             self._arm(stale)
         return ResetInfo(
-            instruction=tuple(self._tasks[int(task)].spec.instruction for task in self._placement.task),
+            instruction=tuple(self._tasks[int(task)].source.instruction for task in self._placement.task),
             episode_id=tuple(
                 f"{self.suite}/{task}/{episode}"
                 for task, episode in zip(self._placement.task, self._placement.episode, strict=True)
@@ -233,18 +242,19 @@ class LiberoEnv:
             self._fault[slot] = ""
         self._live |= stale
         settle = np.tile(SETTLE_ACTION, (self.num_envs, 1))
-        for _ in range(self.config.settle_steps):
+        for _ in range(self.config.settle_steps if self.config.start == "raw" else 0):
             self.physics.control_step(settle, stale)
         self._quarantine(stale)
 
     def _start(self, scene: Scene, task: int, slots: np.ndarray) -> Start:
         data = self._tasks[task]
         episodes = self._placement.episode[slots]
-        states = data.spec.init_states()[episodes]
+        qpos, qvel = self._stored(data)
         nq, nv = scene.model.nq, scene.model.nv
-        if states.shape[1] != 1 + nq + nv:
+        if (qpos.shape[1], qvel.shape[1]) != (nq, nv):
             raise LiberoError(
-                f"{data.spec.init_states_path}: rows of {states.shape[1]} numbers, but the scene has 1 + {nq} + {nv}"
+                f"{self.suite} task {task} ({data.source.name}): starts of {qpos.shape[1]} + {qvel.shape[1]} numbers, "
+                f"but the scene has {nq} positions and {nv} velocities"
             )
         bodies, pos, quat = fixture_poses.poses(
             data.problem,
@@ -253,7 +263,26 @@ class LiberoEnv:
             keys=[(self.config.seed, self.suite, task, int(episode)) for episode in episodes],
             slots=slots.tolist(),
         )
-        return Start(qpos=states[:, 1 : 1 + nq], qvel=states[:, 1 + nq :], bodies=bodies, body_pos=pos, body_quat=quat)
+        settled = self.config.start == "settled"
+        return Start(
+            qpos=qpos[episodes],
+            qvel=qvel[episodes],
+            bodies=bodies,
+            body_pos=pos,
+            body_quat=quat,
+            time=settled_starts.TIME if settled else 0.0,
+            settled=settled,
+        )
+
+    def _stored(self, data: _TaskData) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [50, nq] and velocities [50, nv] of a task's starts."""
+        if self.config.start == "settled":
+            starts = data.source.settled()
+            return starts.qpos, starts.qvel
+        states, free_joints = data.source.init_states(), len(data.problem.objects)
+        # Robot, hinges and slides have as many positions as velocities; a free joint has one position more.
+        nq = (states.shape[1] - 1 + free_joints) // 2
+        return states[:, 1 : 1 + nq], states[:, 1 + nq :]
 
     def close(self) -> None:
         """Release the physics; the environment cannot be used afterwards. Closing twice is harmless."""
@@ -285,8 +314,22 @@ class LiberoEnv:
             reward += self._tick(chunk[:, k], ~self._done)
         return self._control(Control, reward, mended, before)
 
+    @contextmanager
+    def watched(self, watcher: Watcher) -> Iterator[None]:
+        """While inside, ``watcher(actions [B, 7], active bool [B])`` is called before every tick of an episode.
+
+        It sees what any verb executes, ``step_ee_pose`` included; settling is not part of an episode.
+        """
+        self._watchers.append(watcher)
+        try:
+            yield
+        finally:
+            self._watchers.remove(watcher)
+
     def _tick(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
         """One control tick of the active slots; returns its rewards [B]."""
+        for watcher in self._watchers:
+            watcher(actions, active)
         self.physics.control_step(actions, active)
         self._steps[active] += 1
         success = self._judge() & active
@@ -638,17 +681,18 @@ def make(
     task: Any = None,
     tasks: Any = None,
     episodes: Any = None,
+    scenes: str | Path | None = None,
     **options: Any,
 ) -> LiberoEnv:
     """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments."""
-    specs = list_tasks(suite)
+    sources = installed_tasks(suite) if scenes is None else exported_tasks(scenes, suite)
     if task is not None and tasks is not None:
         raise LiberoError("give task or tasks, not both")
     chosen = tasks if task is None else task
     placement = placing.cross(
-        range(len(specs)) if chosen is None else chosen,
+        range(len(sources)) if chosen is None else chosen,
         range(NUM_EPISODES) if episodes is None else episodes,
-        num_tasks=len(specs),
+        num_tasks=len(sources),
         num_episodes=NUM_EPISODES,
     )
-    return LiberoEnv(suite, placement, LiberoConfig(**options))
+    return LiberoEnv(suite, sources, placement, LiberoConfig(**options))

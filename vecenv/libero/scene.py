@@ -94,7 +94,6 @@ class Scene:
     Attributes:
         problem_name: LIBERO's problem class, lower case.
         model: the compiled model; treat it as read-only.
-        xml: the MJCF it came from.
         arena: the workspace's facts.
         entities: objects, then fixtures, in upstream's order, by name.
         regions: regions by name.
@@ -102,7 +101,6 @@ class Scene:
 
     problem_name: str
     model: mujoco.MjModel
-    xml: str
     arena: Arena
     entities: Mapping[str, Entity]
     regions: Mapping[str, RegionSite]
@@ -149,9 +147,59 @@ class Scene:
         return np.array([[-0.7, -0.4, z - 0.10], [0.3, 0.5, z + 0.35]])
 
 
+@dataclass(frozen=True, kw_only=True)
+class SceneSource:
+    """A scene before MuJoCo compiles it: together with the files the MJCF refers to, all that the result depends on.
+
+    Attributes:
+        problem_name, arena, entities, regions: as in :class:`Scene`.
+        xml: the MJCF, with absolute file paths.
+        origin: the problem's file, for messages.
+    """
+
+    problem_name: str
+    xml: str
+    arena: Arena
+    entities: Mapping[str, Entity]
+    regions: Mapping[str, RegionSite]
+    origin: str
+
+    def compile(self) -> Scene:
+        """Let MuJoCo compile it.
+
+        Raises:
+            SceneError: MuJoCo refuses the model.
+        """
+        try:
+            model = mujoco.MjSpec.from_string(self.xml).compile()
+        except ValueError as error:
+            raise SceneError(f"{self.origin}: MuJoCo rejects the scene: {error}") from error
+        return Scene(
+            problem_name=self.problem_name, model=model, arena=self.arena, entities=self.entities, regions=self.regions
+        )
+
+
 def contact_sensor_name(first: str, second: str) -> str:
     """Name of the sensor that counts the contacts between two things, in either order."""
     return f"contact:{min(first, second)}|{max(first, second)}"
+
+
+def scene_source(
+    problem: Problem, *, contact_pairs: Iterable[tuple[str, str]] = (), visual: bool = False
+) -> SceneSource:
+    """Put the MJCF of a problem together; arguments and errors as for ``compile_scene``."""
+    builder = _Builder(problem)
+    builder.add_contact_sensors(contact_pairs)
+    if not visual:
+        mjcf.remove_visuals(builder.root)
+    return SceneSource(
+        problem_name=problem.name,
+        xml=ET.tostring(builder.root, encoding="unicode"),
+        arena=builder.arena,
+        entities=MappingProxyType(builder.entities),
+        regions=MappingProxyType(builder.regions),
+        origin=problem.source,
+    )
 
 
 def compile_scene(problem: Problem, *, contact_pairs: Iterable[tuple[str, str]] = (), visual: bool = False) -> Scene:
@@ -166,23 +214,7 @@ def compile_scene(problem: Problem, *, contact_pairs: Iterable[tuple[str, str]] 
         SceneError: unknown problem class or object category, an asset that breaks the conventions, or a model that
             MuJoCo refuses.
     """
-    builder = _Builder(problem)
-    builder.add_contact_sensors(contact_pairs)
-    if not visual:
-        mjcf.remove_visuals(builder.root)
-    xml = ET.tostring(builder.root, encoding="unicode")
-    try:
-        model = mujoco.MjSpec.from_string(xml).compile()
-    except ValueError as error:
-        raise SceneError(f"{problem.source}: MuJoCo rejects the scene: {error}") from error
-    return Scene(
-        problem_name=problem.name,
-        model=model,
-        xml=xml,
-        arena=builder.arena,
-        entities=MappingProxyType(builder.entities),
-        regions=MappingProxyType(builder.regions),
-    )
+    return scene_source(problem, contact_pairs=contact_pairs, visual=visual).compile()
 
 
 class _Builder:
