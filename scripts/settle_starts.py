@@ -137,9 +137,8 @@ def settle(spec: Any) -> tuple[np.ndarray, np.ndarray]:
     physics.place(group, np.arange(n), start)
     for _ in range(SETTLE_TICKS):
         physics.control_step(np.tile(SETTLE_ACTION, (n, 1)), np.ones(n, bool))
-    faults = [fault for fault in physics.fault if fault]
-    if faults:
-        raise SystemExit(f"{spec.suite}/{spec.index}: {len(faults)} starts failed: {faults[0]}")
+    if physics.faults:
+        raise SystemExit(f"{spec.suite}/{spec.index}: starts failed: {physics.faults}")
     return group.qpos.copy(), group.qvel.copy()
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import vecenv
 from vecenv.actions import ActionError
-from vecenv.contract import BatchEnv
+from vecenv.contract import BatchEnv, ImagesUnavailable
 from vecenv.libero import scene as scene_module
 from vecenv.libero import sources
 from vecenv.libero.env import LiberoEnv, LiberoError
@@ -351,12 +351,13 @@ class TestObservations:
         assert again is not None
         np.testing.assert_array_equal(objects.poses["cream_cheese_1"], again.poses["cream_cheese_1"])
 
-    def test_images_are_none_without_a_renderer(self, env: LiberoEnv) -> None:
+    def test_state_is_there_and_asking_for_an_image_is_an_error(self, env: LiberoEnv) -> None:
         observation = env.observe_egocentric()
         assert observation.state.shape == (3, 8)
         assert observation.state.dtype == np.float32
-        assert observation.rgb is None
-        assert observation.observation == [None, None]
+        for name in ("rgb", "agentview_image", "wrist_image", "observation", "depth"):
+            with pytest.raises(ImagesUnavailable, match="renders nothing"):
+                getattr(observation, name)
         assert observation.pose is None
 
     def test_objects_carry_names_points_goal_and_bounds(self, env: LiberoEnv) -> None:

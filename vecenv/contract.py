@@ -20,6 +20,7 @@ Rules that hold for every environment:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -94,35 +95,59 @@ class EePoseControl(Control):
     error: tuple[str, ...] = ()
 
 
+class ImagesUnavailable(LookupError):
+    """An image was asked of an observation that has none; the message says which and what is there."""
+
+
 @dataclass(frozen=True)
 class Egocentric:
     """``observe_egocentric``'s return.
 
     Attributes:
         state: 8-D proprioception, float32 [B, 8]: end-effector position, axis-angle orientation, two finger positions.
-        rgb: third-person camera, uint8 [B, H, W, 3], or None when no camera is rendered.
-        wrist_image: wrist camera, uint8 [B, H, W, 3], or None.
-        depth: depth of the third-person camera in metres, float32 [B, H, W], or None.
+        images: camera images by name, uint8 [B, H, W, 3]; empty when the environment does not render.
+        depths: depth images by camera, metres, float32 [B, H, W]; likewise.
         pose: navigation pose; always None for manipulation.
         intrinsics: camera matrices [B, 3, 3], or None.
     """
 
     state: np.ndarray
-    rgb: np.ndarray | None = None
-    wrist_image: np.ndarray | None = None
-    depth: np.ndarray | None = None
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
+    depths: Mapping[str, np.ndarray] = field(default_factory=dict)
     pose: None = None
     intrinsics: np.ndarray | None = None
 
     @property
-    def agentview_image(self) -> np.ndarray | None:
+    def rgb(self) -> np.ndarray:
+        """The third-person camera's image, [B, H, W, 3]; raises ``ImagesUnavailable`` where nothing renders."""
+        return _camera(self.images, "agentview", "image")
+
+    @property
+    def agentview_image(self) -> np.ndarray:
         """LIBERO's name for ``rgb``."""
         return self.rgb
 
     @property
-    def observation(self) -> list[np.ndarray | None]:
+    def wrist_image(self) -> np.ndarray:
+        """The wrist camera's image, [B, H, W, 3]; raises ``ImagesUnavailable`` where nothing renders."""
+        return _camera(self.images, "wrist", "image")
+
+    @property
+    def observation(self) -> list[np.ndarray]:
         """The two camera images in the order policies expect: third-person, wrist."""
         return [self.rgb, self.wrist_image]
+
+    @property
+    def depth(self) -> np.ndarray:
+        """The third-person camera's depth, [B, H, W]; raises ``ImagesUnavailable`` where nothing renders."""
+        return _camera(self.depths, "agentview", "depth image")
+
+
+def _camera(found: Mapping[str, np.ndarray], name: str, what: str) -> np.ndarray:
+    if name not in found:
+        there = f"rendered: {', '.join(found)}" if found else "this environment renders nothing; `state` is there"
+        raise ImagesUnavailable(f"no {what} of camera {name!r}: {there}")
+    return found[name]
 
 
 @dataclass(frozen=True)

@@ -356,8 +356,8 @@ class LiberoEnv:
         return verdict
 
     def _quarantine(self, among: np.ndarray) -> None:
-        for slot, reason in enumerate(self.physics.fault):
-            if reason and among[slot] and not self._fault[slot]:
+        for slot, reason in self.physics.faults.items():
+            if among[slot] and not self._fault[slot]:
                 self._fault[slot] = reason
                 self._truncated[slot] = True
                 self._terminated[slot] = self._success[slot] = False
@@ -430,7 +430,7 @@ class LiberoEnv:
     # -- perception ----------------------------------------------------------------------------------------------------
 
     def observe_egocentric(self) -> Egocentric:
-        """Proprioception of every slot; images come with a renderer, and ``rgb`` is None without one."""
+        """Proprioception of every slot. There is no renderer yet: asking the result for an image says so."""
         self._check_live()
         physics = self.physics
         state = np.concatenate([physics.eef_pos, axis_angle(physics.eef_quat), physics.fingers], axis=1)

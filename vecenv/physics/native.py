@@ -178,7 +178,7 @@ class NativePhysics:
         eef_pos: end-effector position as robosuite's observables report it, metres, [B, 3].
         eef_quat: hand orientation likewise, wxyz, [B, 4].
         fingers: the two finger positions likewise, metres, [B, 2].
-        fault: why each slot's physics failed, "" when it did not, B strings.
+        faults: why the physics of a slot failed, by slot; empty when all are healthy.
     """
 
     def __init__(self, scenes: Sequence[Scene], scene_of_slot: np.ndarray, num_threads: int | None = None) -> None:
@@ -203,7 +203,7 @@ class NativePhysics:
         self.eef_pos = np.zeros((self.num_envs, 3))
         self.eef_quat = np.zeros((self.num_envs, 4))
         self.fingers = np.zeros((self.num_envs, 2))
-        self.fault = [""] * self.num_envs
+        self.faults: dict[int, str] = {}
 
     def serves(self, scenes: Sequence[Scene], scene_of_slot: np.ndarray) -> bool:
         """Whether this batch already has these scenes in these slots."""
@@ -215,8 +215,8 @@ class NativePhysics:
     def place(self, group: Group, slots: np.ndarray, start: Start) -> None:
         """Begin an episode in ``slots``, all of ``group``: physics state, fixture poses, controller memory."""
         rows = np.searchsorted(group.slots, slots)
-        for slot in slots:
-            self.fault[slot] = ""
+        for slot in slots.tolist():
+            self.faults.pop(slot, None)
         self._guarded(group, lambda: group.place(rows, start))
         placed = np.isin(self._order, slots)
         self._fresh[placed] = not start.settled
@@ -296,7 +296,7 @@ class NativePhysics:
             call()
         except SimulationError as error:
             for row in error.ids:
-                self.fault[group.slots[row]] = f"MuJoCo: {group.batch.error(int(row))}"
+                self.faults[int(group.slots[row])] = f"MuJoCo: {group.batch.error(int(row))}"
 
     def _observe_pose(self, group: Group, rows: _Rows) -> None:
         chosen = slice(None) if rows is None else rows
@@ -311,7 +311,7 @@ class NativePhysics:
     def _collect_faults(self) -> None:
         for group in self.groups:
             for row, reason in group.faults():
-                self.fault[group.slots[row]] = self.fault[group.slots[row]] or reason
+                self.faults.setdefault(int(group.slots[row]), reason)
 
 
 @functools.cache
