@@ -1,13 +1,15 @@
 """``vecenv bench physics``: how many control steps a second, against upstream on the same cores in the same run.
 
-Three sides step the same tasks from the same stored starts with the same random actions, without images: upstream's
-``SubprocVectorEnv`` with a process a core, vecenv, and MuJoCo alone (``Batch.step`` of vecenv's own batch, without
-controller and verdicts), which bounds what any environment on top of it can reach. Each measurement is a process of its
-own, sides take turns, and medians of their rounds are compared, ratio first.
+The same tasks are stepped from the same stored starts with the same random actions, without images: by upstream's
+``SubprocVectorEnv`` with a process a core, by vecenv, and by MuJoCo alone on vecenv's batch, without controller and
+verdicts. MuJoCo alone comes in two kinds: *bare* calls ``Batch.step`` 25 times a control step, which is what a
+controller that acts every substep needs; *fused* calls it once for all 25, which keeps each simulation in the cache.
+Each measurement is a process of its own, sides take turns, and medians of their rounds are compared, ratio first.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import subprocess
 import sys
@@ -81,10 +83,10 @@ def _upstream_vector_env(bddl_path: str, processes: int) -> Any:
     return SubprocVectorEnv([make] * processes)
 
 
-def measure_vecenv(suite: str, task: int, num_envs: int, threads: int, seconds: float) -> tuple[float, float]:
-    """Control steps a second of vecenv, and of MuJoCo alone on the same batch: 25 substeps from the same states.
+def measure_vecenv(suite: str, task: int, num_envs: int, threads: int, seconds: float) -> dict[str, float]:
+    """Control steps a second of vecenv, and of MuJoCo alone on the same batch from the same states, bare and fused.
 
-    The two take turns tick by tick, MuJoCo with the controls that vecenv used last.
+    The three take turns tick by tick, MuJoCo with the controls that vecenv used last.
     """
     from vecenv.libero.env import LiberoEnv
 
@@ -92,22 +94,26 @@ def measure_vecenv(suite: str, task: int, num_envs: int, threads: int, seconds: 
     assert isinstance(env, LiberoEnv)
     env.reset()
     group = env.physics.groups[0]
-    bare = _bare_batch(group, threads)
+    alone = _bare_batch(group, threads)
+
+    def bare() -> None:
+        for _ in range(25):
+            alone.step()
+
     for tick in range(10):
         env.step_continuous(random_actions(num_envs, tick))
-    ticks, ours, alone = 0, 0.0, 0.0
-    while ours + alone < 2 * seconds:
-        bare.state[:] = group.batch.state
-        begin = time.perf_counter()
-        bare.step(nstep=25)
-        alone += time.perf_counter() - begin
+    ticks, spent = 0, {"bare": 0.0, "fused": 0.0, "vecenv": 0.0}
+    while sum(spent.values()) < 3 * seconds:
         actions = random_actions(num_envs, ticks)
-        begin = time.perf_counter()
-        env.step_continuous(actions)
-        ours += time.perf_counter() - begin
+        calls = (bare, lambda: alone.step(nstep=25), functools.partial(env.step_continuous, actions))
+        for name, call in zip(spent, calls, strict=True):
+            alone.state[:] = group.batch.state
+            begin = time.perf_counter()
+            call()
+            spent[name] += time.perf_counter() - begin
         ticks += 1
     env.close()
-    return ticks * num_envs / ours, ticks * num_envs / alone
+    return {name: ticks * num_envs / value for name, value in spent.items()}
 
 
 def _bare_batch(group: Any, threads: int) -> Any:
@@ -150,8 +156,7 @@ def _worker(side: str, arguments: Mapping[str, Any]) -> dict[str, float]:
     if side == "upstream":
         return {"upstream": measure_upstream(**arguments)}
     if side == "vecenv":
-        rate, bare = measure_vecenv(**arguments)
-        return {"vecenv": rate, "bare": bare}
+        return measure_vecenv(**arguments)
     if side == "suite":
         return execute_upstream(**arguments)
     raise ValueError(f"no side called {side!r}")
@@ -159,7 +164,7 @@ def _worker(side: str, arguments: Mapping[str, Any]) -> dict[str, float]:
 
 def compare_scene(suite: str, task: int, *, rounds: int, seconds: float, num_envs: int, cores: int) -> dict[str, Any]:
     """One row: medians over rounds in which the sides take turns."""
-    found: dict[str, list[float]] = {"upstream": [], "vecenv": [], "bare": []}
+    found: dict[str, list[float]] = {"upstream": [], "vecenv": [], "bare": [], "fused": []}
     for _ in range(rounds):
         sides = (
             _in_a_process("upstream", suite=suite, task=task, processes=cores, seconds=seconds),
@@ -169,14 +174,19 @@ def compare_scene(suite: str, task: int, *, rounds: int, seconds: float, num_env
             for name, value in side.items():
                 found[name].append(value)
     ratios = [ours / theirs for ours, theirs in zip(found["vecenv"], found["upstream"], strict=True)]
-    shares = [ours / bare for ours, bare in zip(found["vecenv"], found["bare"], strict=True)]
+    shares = {
+        kind: median(ours / alone for ours, alone in zip(found["vecenv"], found[kind], strict=True))
+        for kind in ("bare", "fused")
+    }
     return {
         "scene": f"{suite}/{task}",
         "vecenv / upstream": median(ratios),
-        "vecenv / bare": median(shares),
+        "vecenv / bare": shares["bare"],
+        "vecenv / fused": shares["fused"],
         "vecenv steps/s": round(median(found["vecenv"])),
         "upstream steps/s": round(median(found["upstream"])),
         "bare steps/s": round(median(found["bare"])),
+        "fused steps/s": round(median(found["fused"])),
         "ratios": " ".join(f"{ratio:.2f}" for ratio in sorted(ratios)),
     }
 
@@ -317,6 +327,7 @@ def _sweep(suite: str, task: int, seconds: float, cores: int) -> list[dict[str, 
                     "B": num_envs,
                     "vecenv / bare": found["vecenv"] / found["bare"],
                     "vecenv steps/s": round(found["vecenv"]),
+                    "vecenv / fused": found["vecenv"] / found["fused"],
                     "bare steps/s": round(found["bare"]),
                 }
             )
