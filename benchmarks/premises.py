@@ -35,7 +35,7 @@ BACKENDS = ("native",)
 
 def check_task(suite: str, task: int, start: str, backend: str) -> dict[str, dict[str, list[int]]]:
     """Premise -> what -> episodes that miss it."""
-    options = {"start": "raw", "settle_steps": 0} if start == "stored" else {"start": start}
+    options: dict[str, Any] = {"start": "raw", "settle_steps": 0} if start == "stored" else {"start": start}
     env = vecenv.make(suite, task=task, episodes=range(NUM_EPISODES), backend=backend, **options)
     assert isinstance(env, LiberoEnv)
     env.reset()
