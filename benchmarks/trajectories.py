@@ -10,7 +10,6 @@ starts 1e-15 rad away.
 from __future__ import annotations
 
 import argparse
-import math
 from typing import Any
 
 import numpy as np
@@ -37,13 +36,6 @@ def random_actions(seed: int, ticks: int) -> np.ndarray:
         action[6] = rng.choice([-1.0, 1.0])
         actions += [action] * int(rng.integers(1, 8))
     return np.array(actions[:ticks])
-
-
-def rotation_vector(quat: np.ndarray) -> np.ndarray:
-    """Angle times axis of a quaternion xyzw."""
-    w = min(max(float(quat[3]), -1.0), 1.0)
-    length = math.sqrt(1.0 - w * w)
-    return np.zeros(3) if length == 0.0 else quat[:3] * (2.0 * math.acos(w) / length)
 
 
 def robot_touches(model: Any, data: Any) -> bool:
@@ -80,7 +72,7 @@ def compare(spec: TaskSpec, episode: int) -> dict[str, Any]:
         theirs = np.concatenate(
             [
                 observation["robot0_eef_pos"],
-                rotation_vector(observation["robot0_eef_quat"]),
+                upstream.rotation_vector(observation["robot0_eef_quat"]),
                 observation["robot0_gripper_qpos"],
             ]
         )

@@ -201,7 +201,7 @@ def physics_command(
     out: Path | None = typer.Option(None, help="Write the rows, machine and versions as JSON."),
 ) -> None:
     """Control steps a second against upstream's SubprocVectorEnv and against MuJoCo alone, no images."""
-    from vecenv.doctor import usable_cores
+    from vecenv.machine import usable_cores
 
     chosen = [_scene(text) for text in scene] if scene else list(SCENES)
     cores = usable_cores()
@@ -231,7 +231,7 @@ def suite_command(
     """
     from tempfile import TemporaryDirectory
 
-    from vecenv.doctor import usable_cores
+    from vecenv.machine import usable_cores
 
     cores = usable_cores()
     with TemporaryDirectory() as folder:

@@ -5,7 +5,6 @@ The peer is LIBERO on robosuite 1.4.0 under the installed MuJoCo, without images
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -27,13 +26,6 @@ TASKS = [
     ("libero_10", 9),
     ("libero_90", 60),
 ]
-
-
-def rotation_vector(quat: np.ndarray) -> np.ndarray:
-    """Angle times axis of a quaternion xyzw, as LIBERO policies compute their proprioception."""
-    w = min(max(float(quat[3]), -1.0), 1.0)
-    length = math.sqrt(1.0 - w * w)
-    return np.zeros(3) if length == 0.0 else quat[:3] * (2.0 * math.acos(w) / length)
 
 
 def random_actions(seed: int, ticks: int) -> np.ndarray:
@@ -76,7 +68,11 @@ def test_a_rollout_is_upstreams(suite: str, task: int) -> None:
         control = env.step_continuous(action[None])
         np.testing.assert_allclose(env.state().qpos[0], upstream.data_of(peer).qpos, atol=1e-6, err_msg=f"tick {tick}")
         proprioception = np.concatenate(
-            [theirs["robot0_eef_pos"], rotation_vector(theirs["robot0_eef_quat"]), theirs["robot0_gripper_qpos"]]
+            [
+                theirs["robot0_eef_pos"],
+                upstream.rotation_vector(theirs["robot0_eef_quat"]),
+                theirs["robot0_gripper_qpos"],
+            ]
         )
         # Ours is float32, as policies take it.
         np.testing.assert_allclose(env.observe_egocentric().state[0], proprioception, atol=1e-6, err_msg=f"tick {tick}")

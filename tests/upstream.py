@@ -11,6 +11,7 @@ import contextlib
 import functools
 import io
 import logging
+import math
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator
@@ -170,3 +171,10 @@ def task_text(problem: str, category: str = "akita_black_bowl", fixture: str = "
     arena = ARENAS.get(problem, ARENAS["libero_floor_manipulation"])
     table = arena.workspace_category
     return _TASK.format(problem=problem, workspace=arena.workspace, table=table, category=category, fixture=fixture)
+
+
+def rotation_vector(quat: np.ndarray) -> np.ndarray:
+    """Angle times axis of a quaternion xyzw, as LIBERO policies compute their proprioception."""
+    w = min(max(float(quat[3]), -1.0), 1.0)
+    length = math.sqrt(1.0 - w * w)
+    return np.zeros(3) if length == 0.0 else quat[:3] * (2.0 * math.acos(w) / length)

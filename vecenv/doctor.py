@@ -27,6 +27,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
+from vecenv.machine import usable_cores
+
 DISTRIBUTION = "vecenv"
 # Distributions worth naming although no requirement of ours names them.
 ALSO_SHOWN = ("jaxlib", "robosuite")
@@ -167,11 +169,6 @@ def machine() -> dict[str, Any]:
         "cores": usable_cores(),
         "memory_gib": _memory_gib(),
     }
-
-
-def usable_cores() -> int:
-    """Cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def packages() -> tuple[Package, ...]:

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -34,6 +33,7 @@ from mujoco.batch import Batch, SimulationError
 
 from vecenv.controllers import osc
 from vecenv.libero.scene import ARM_JOINTS, HOME_QPOS, Scene
+from vecenv.machine import usable_cores
 
 SUBSTEPS = 25
 # Substeps after which robosuite's observables have read the kinematics and the finger joints (see the docstring above).
@@ -332,11 +332,6 @@ def _choose_goals(mask: np.ndarray, goal: osc.OscGoal, other: osc.OscGoal) -> os
         return osc.OscGoal(
             jnp.where(mask[:, None], goal.pos, other.pos), jnp.where(mask[:, None, None], goal.mat, other.mat)
         )
-
-
-def usable_cores() -> int:
-    """Cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def home_row(scene: Scene) -> np.ndarray:
