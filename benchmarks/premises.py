@@ -71,9 +71,9 @@ def init_predicates(env: LiberoEnv, suite: str, task: int) -> dict[str, np.ndarr
     premise = dataclasses.replace(problem, goal=wanted)
     scene = compile_scene(premise, contact_pairs=goals.contact_pairs([premise]))
     table = goals.build_table([premise], scene, [0] * env.num_envs)
-    probe = Group(scene, np.arange(env.num_envs), 0)
+    probe = Group(scene, np.arange(env.num_envs))
     bodies = np.array([scene.model.body(entity.root_body).id for entity in scene.fixtures], int)
-    pos, quat = (group.batch.expand(field)[:, bodies] for field in ("body_pos", "body_quat"))
+    pos, quat = (group.expand(field)[:, bodies] for field in ("body_pos", "body_quat"))
     start = Start(qpos=group.qpos, qvel=group.qvel, bodies=bodies, body_pos=pos, body_quat=quat)
     probe.place(np.arange(env.num_envs), start)
     values = goals.predicates(

@@ -107,7 +107,7 @@ def measure_vecenv(suite: str, task: int, num_envs: int, threads: int, seconds: 
         actions = random_actions(num_envs, ticks)
         calls = (bare, lambda: alone.step(nstep=25), functools.partial(env.step_continuous, actions))
         for name, call in zip(spent, calls, strict=True):
-            alone.state[:] = group.batch.state
+            alone.state[:] = group.state
             begin = time.perf_counter()
             call()
             spent[name] += time.perf_counter() - begin
@@ -123,7 +123,7 @@ def _bare_batch(group: Any, threads: int) -> Any:
     bare = Batch(group.scene.model, len(group.slots), threads, persistent=True)
     if group.scene.fixtures:
         for field in ("body_pos", "body_quat"):
-            bare.expand(field)[:] = group.batch.expand(field)
+            bare.expand(field)[:] = group.expand(field)
     return bare
 
 

@@ -71,7 +71,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def copy(exported: Path, tmp_path: Path) -> Path:
     """An export to damage; its scenes are those of libero_goal only."""
     folder = tmp_path / "copy"
-    scenes = {task.scene_id for task in ExportFolder(exported).tasks("libero_goal")}
+    scenes = {task.scene_ids["exact"] for task in ExportFolder(exported).tasks("libero_goal")}
     for path in exported.rglob("*.*"):
         if path.parent.name != "scenes" or path.stem in scenes:
             (folder / path.relative_to(exported)).parent.mkdir(parents=True, exist_ok=True)
@@ -122,7 +122,7 @@ def test_a_scene_is_exported_once_with_the_contact_sensors_of_all_its_tasks(expo
     scenes = {id(task.scene(())) for task in tasks}
     assert len(scenes) == len({task.problem().scene_key() for task in tasks}) < len(tasks)
     for task in tasks:
-        sharing = [t.problem() for t in tasks if t.scene_id == task.scene_id]
+        sharing = [t.problem() for t in tasks if t.scene_ids == task.scene_ids]
         assert task.scene(()).model.nsensor == len(goals.contact_pairs(sharing))
         goals.build_table([task.problem()], task.scene(()), [0])
 
@@ -151,7 +151,7 @@ def test_a_folder_may_be_given_as_text(exported: Path) -> None:
 
 
 def the_scene(folder: Path) -> Path:
-    return folder / "scenes" / f"{ExportFolder(folder).tasks('libero_goal')[0].scene_id}.mjb"
+    return folder / "scenes" / f"{ExportFolder(folder).tasks('libero_goal')[0].scene_ids["exact"]}.mjb"
 
 
 def edit_index(**changes: Any) -> Callable[[Path], None]:

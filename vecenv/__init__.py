@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from vecenv.contract import BatchEnv
     from vecenv.libero.suites import TaskSpec
+    from vecenv.physics.budgets import Budget
 
 __version__ = "0.1.0"
 __all__ = ["eval_metadata", "list_suites", "list_tasks", "make"]
@@ -31,6 +32,8 @@ def make(
     max_steps: int = 2500,
     seed: int = 0,
     num_threads: int | None = None,
+    num_devices: int = 1,
+    budget: Budget | None = None,
     scenes: str | Path | None = None,
 ) -> BatchEnv:
     """A batch of episodes: every one of ``episodes`` of every one of ``tasks``, task by task, one a slot.
@@ -40,8 +43,9 @@ def make(
         task: a single task index.
         tasks: several task indices; all tasks of the suite when neither is given.
         episodes: init states 0 to 49, one or several; or a mapping task -> init states. All 50 by default.
-        backend: ``"native"``: MuJoCo, C threads, float64.
-        geometry: ``"exact"``: the collision geometry of upstream.
+        backend: ``"native"``: MuJoCo on CPU threads, float64. ``"warp"``: MJX on MuJoCo Warp (NVIDIA GPUs; also runs on
+            a CPU). ``"jax"``: MJX in pure JAX, any device. ``"mjx"``: warp on CUDA, jax elsewhere.
+        geometry: ``"exact"``: the collision geometry of upstream. ``"lean"``: at most 24 fitted geoms a scene.
         fixtures: where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"`` from it
             (a function of seed, suite, task and episode), or name -> (pos [3] or [B, 3], quat wxyz [4] or [B, 4]).
         start: ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them (fixtures at the centre);
@@ -49,7 +53,9 @@ def make(
         settle_steps: for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
         max_steps: step budget in control ticks (20 a second).
         seed: see ``fixtures``.
-        num_threads: C threads; None for one a core.
+        num_threads: threads of the native backend; None for one a core.
+        num_devices: devices that MJX spreads the slots over.
+        budget: contact and constraint memory on MJX; None measures each scene once and remembers it.
         scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and no
             LIBERO or robosuite files are needed. Otherwise from the installed packages.
 
@@ -71,6 +77,8 @@ def make(
         max_steps=max_steps,
         seed=seed,
         num_threads=num_threads,
+        num_devices=num_devices,
+        budget=budget,
         scenes=scenes,
     )
 

@@ -13,11 +13,13 @@ For LIBERO a translation of 1 is 0.05 m and a rotation of 1 is 0.5 rad, relative
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from vecenv.contract import ACTION_DIM, EE_POSE_DIM
+from vecenv.controllers.waypoint import Plan, Pose
 
 _NO_LENGTH = 1e-6
 _MOST_STEPS = 2**31 - 1
@@ -103,6 +105,43 @@ def ee_poses(value: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray, tuple[s
         for ok, turn in zip(finite, unit, strict=True)
     )
     return clean, finite & unit, errors
+
+
+def plan(value: Any, num_envs: int) -> tuple[Plan, tuple[str, ...]]:
+    """Validate the input of ``step_waypoints``.
+
+    Args:
+        value: a plan with the attributes, or a mapping with the keys, ``poses`` [B, T, 7] (xyz, wxyz), ``grip`` [B, T],
+            ``hold`` [B, T] and ``valid`` [B, T].
+        num_envs: B.
+
+    Returns:
+        The plan with unit quaternions, bad waypoints marked invalid; and what was wrong in each slot, B strings.
+
+    Raises:
+        ActionError: the wrong shape or not numbers.
+    """
+    poses = _plan_field(value, "poses", num_envs, (7,))
+    shape = poses.shape[:2]
+    grip, hold, valid = (_plan_field(value, name, num_envs, (), shape[1]) for name in ("grip", "hold", "valid"))
+    rows = np.concatenate([poses, grip[..., None]], axis=-1).reshape(-1, EE_POSE_DIM)
+    clean, usable, problems = ee_poses(rows, len(rows))
+    clean, wanted = clean.reshape(*shape, EE_POSE_DIM), valid != 0
+    holds = hold_steps(hold.reshape(-1), len(rows)).reshape(shape)
+    reasons = np.where(wanted, np.array(problems, object).reshape(shape), "")
+    errors = tuple("; ".join(f"waypoint {t}: {reason}" for t, reason in enumerate(row) if reason) for row in reasons)
+    pose = Pose(clean[..., :3], clean[..., 3:7])
+    return Plan(pose, clean[..., 7], holds, wanted & usable.reshape(shape)), errors
+
+
+def _plan_field(value: Any, name: str, num_envs: int, tail: tuple[int, ...], count: int | None = None) -> np.ndarray:
+    found = value.get(name) if isinstance(value, Mapping) else getattr(value, name, None)
+    right = f"[{', '.join(map(str, (num_envs, 'T' if count is None else count, *tail)))}]"
+    array = _array([] if found is None else found, f"plan.{name}", right)
+    fits = array.ndim == 2 + len(tail) and array.shape[0] == num_envs and array.shape[2:] == tail and array.shape[1] > 0
+    if not fits or count not in (None, array.shape[1]):
+        raise ActionError(f"plan.{name}: got shape {array.shape}; expected {right}")
+    return array
 
 
 def hold_steps(value: Any, num_envs: int) -> np.ndarray:

@@ -88,6 +88,7 @@ def list_command(
 def compile_command(
     out: Path = typer.Option(..., "--out", metavar="DIR", help="Folder to write; make(..., scenes=DIR) reads it."),
     suite: list[str] = typer.Option([], "--suite", help="A suite to export; may be given again. All by default."),
+    geometry: list[str] = typer.Option(["exact"], "--geometry", help="exact or lean; may be given again."),
 ) -> None:
     """Export suites into one folder that needs no LIBERO or robosuite files: tasks, starts and compiled scenes."""
     from rich.console import Console
@@ -96,6 +97,7 @@ def compile_command(
     import vecenv
     from vecenv.libero.bddl import BDDLError
     from vecenv.libero.export import ExportError, export
+    from vecenv.libero.geometry import PROFILES
     from vecenv.libero.scene import SceneError
     from vecenv.libero.settled import SettledStartsError
     from vecenv.libero.suites import TaskDataError
@@ -103,10 +105,16 @@ def compile_command(
     for name in suite:
         if name not in vecenv.list_suites():
             fail(unknown("suite", name, vecenv.list_suites()))
+    for name in geometry:
+        if name not in PROFILES:
+            fail(unknown("geometry", name, PROFILES))
     console = Console(stderr=True)
     try:
         done = export(
-            out, suite or None, track=functools.partial(track, console=console, disable=not console.is_terminal)
+            out,
+            suite or None,
+            geometries=geometry,
+            track=functools.partial(track, console=console, disable=not console.is_terminal),
         )
     except ExportError as error:
         fail(str(error))

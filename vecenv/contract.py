@@ -95,6 +95,23 @@ class EePoseControl(Control):
     error: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class PlanControl(Control):
+    """``step_waypoints``' return: control signals plus how the plan was followed.
+
+    Attributes:
+        converged: within tolerance when the waypoint was left, bool [B, T].
+        waypoint_ticks: control ticks spent on each waypoint, int [B, T].
+        final_pose: end-effector pose when the call ended, xyz + wxyz, [B, 7].
+        error: which waypoints of a slot were left out and why ("" when none), B strings.
+    """
+
+    converged: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))
+    waypoint_ticks: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), int))
+    final_pose: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    error: tuple[str, ...] = ()
+
+
 class ImagesUnavailable(LookupError):
     """An image was asked of an observation that has none; the message says which and what is there."""
 
@@ -274,6 +291,10 @@ class BatchEnv(Protocol):
 
     def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
         """Drive the end effectors to absolute poses, [B, 8]."""
+        ...
+
+    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
+        """Follow a plan, waypoints [B, T]."""
         ...
 
     def observe_egocentric(self) -> Egocentric:

@@ -20,7 +20,7 @@ give the simple form.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -65,8 +65,8 @@ STEP_EE_POSE = WaypointConfig()
 class Pose(NamedTuple):
     """Position ``pos`` [..., 3] in metres and unit quaternion ``quat`` [..., 4] wxyz, world frame."""
 
-    pos: jax.Array
-    quat: jax.Array
+    pos: Any
+    quat: Any
 
 
 class Target(NamedTuple):
@@ -187,3 +187,108 @@ def converged(current: Pose, target: Pose, config: WaypointConfig = STEP_EE_POSE
     """
     distance, angle = pose_error(current, target)
     return (distance <= config.pos_tol) & (angle <= config.rot_tol)
+
+
+class Plan(NamedTuple):
+    """Waypoints of B slots, T each, to be followed in order.
+
+    Attributes:
+        pose: targets, [B, T, ...].
+        grip: 1 closed, 0 open, [B, T].
+        hold: control ticks without motion in place of the drive, int [B, T]; 0 drives.
+        valid: bool [B, T]; the others are skipped.
+    """
+
+    pose: Pose
+    grip: Any
+    hold: Any
+    valid: Any
+
+
+class Progress(NamedTuple):
+    """How far each slot has come on its plan.
+
+    Attributes:
+        index: waypoint being followed, int [B]; T when none is left.
+        spent: ticks spent on it, int [B].
+        misses: waypoints in a row that ran out of ticks, int [B].
+        reference: the servo's reference, [B, ...].
+        converged: bool [B, T]; within tolerance when it was left.
+        ticks: ticks spent on each, int [B, T].
+    """
+
+    index: jax.Array
+    spent: jax.Array
+    misses: jax.Array
+    reference: Pose
+    converged: jax.Array
+    ticks: jax.Array
+
+
+def begin_plan(plan: Plan, current: Pose) -> Progress:
+    """Progress before the first tick, from the end effector's pose now."""
+    shape = plan.valid.shape
+    none = jnp.zeros(shape[0], jnp.int32)
+    index = _next_valid(plan.valid, none)
+    return Progress(index, none, none, current, jnp.zeros(shape, bool), jnp.zeros(shape, jnp.int32))
+
+
+def unfinished(plan: Plan, progress: Progress) -> jax.Array:
+    """Bool [B]: a waypoint is left."""
+    return progress.index < plan.valid.shape[1]
+
+
+def plan_action(
+    plan: Plan, progress: Progress, current: Pose, config: WaypointConfig = STEP_EE_POSE
+) -> tuple[jax.Array, Progress]:
+    """Action of one tick, [B, 7], and the progress with the servo's new reference."""
+    target, grip, hold = _at_index(plan, progress.index)
+    moving, ahead = servo(current, target, grip, progress.reference, config)
+    holding = (hold > 0)[:, None]
+    action = jnp.where(holding, hold_action(grip), moving)
+    reference = Pose(*(jnp.where(holding, now, new) for now, new in zip(current, ahead, strict=True)))
+    return action, progress._replace(reference=reference)
+
+
+def plan_advance(
+    plan: Plan, progress: Progress, current: Pose, moved: jax.Array, config: WaypointConfig = STEP_EE_POSE
+) -> Progress:
+    """Progress after a tick.
+
+    Args:
+        plan: the plan.
+        progress: what ``plan_action`` returned.
+        current: the end effector after the tick.
+        moved: bool [B], the slots that took part; the others keep their progress.
+        config: tolerances, and the ticks a waypoint may take.
+    """
+    target, _, hold = _at_index(plan, progress.index)
+    driving = hold == 0
+    arrived = converged(current, target, config)
+    spent = progress.spent + 1
+    left = (arrived & driving) | (spent >= jnp.where(driving, config.max_steps, hold))
+    missed = left & driving & ~arrived
+    misses = jnp.where(left & driving, jnp.where(missed, progress.misses + 1, 0), progress.misses)
+    here = jnp.arange(plan.valid.shape[1]) == progress.index[:, None]
+    after = Progress(
+        index=_next_valid(plan.valid, progress.index + left),
+        spent=jnp.where(left, 0, spent),
+        misses=misses,
+        reference=progress.reference,
+        converged=jnp.where(here, arrived[:, None], progress.converged),
+        ticks=jnp.where(here, spent[:, None], progress.ticks),
+    )
+    return jax.tree.map(lambda new, old: jnp.where(moved.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, progress)
+
+
+def _at_index(plan: Plan, index: jax.Array) -> tuple[Pose, jax.Array, jax.Array]:
+    """Pose, grip and hold of one waypoint a slot; past the end, of the last."""
+    slot, at = jnp.arange(index.shape[0]), jnp.minimum(index, plan.valid.shape[1] - 1)
+    return Pose(plan.pose.pos[slot, at], plan.pose.quat[slot, at]), plan.grip[slot, at], plan.hold[slot, at]
+
+
+def _next_valid(valid: jax.Array, index: jax.Array) -> jax.Array:
+    """The first valid waypoint at or after ``index``, or T."""
+    count = valid.shape[1]
+    ahead = valid & (jnp.arange(count) >= index[:, None])
+    return jnp.where(ahead.any(1), ahead.argmax(1), count).astype(jnp.int32)

@@ -31,6 +31,7 @@ import mujoco
 import numpy as np
 import platformdirs
 
+from vecenv.libero import geometry
 from vecenv.libero.arenas import ARENAS
 from vecenv.libero.bddl import Problem
 from vecenv.libero.scene import Entity, RegionSite, Scene, SceneSource, scene_source
@@ -56,31 +57,51 @@ def folder() -> Path | None:
     return default if default.is_absolute() else None  # "~" stays in it for a user without a home
 
 
-def cached_scene(problem: Problem, *, contact_pairs: Iterable[tuple[str, str]] = ()) -> Scene:
-    """The scene of a problem from the cache, or compiled and put there; arguments and errors of ``compile_scene``."""
+def cached_scene(
+    problem: Problem, *, contact_pairs: Iterable[tuple[str, str]] = (), lean_for: Iterable[Problem] | None = None
+) -> Scene:
+    """The scene of a problem from the cache, or compiled and put there.
+
+    Args:
+        problem: a parsed LIBERO problem.
+        contact_pairs: as for ``compile_scene``, whose errors this raises.
+        lean_for: the tasks to fit lean collision geoms for (``vecenv.libero.geometry``); None keeps upstream's.
+    """
     source, where = scene_source(problem, contact_pairs=contact_pairs), folder()
+    asked = None if lean_for is None else geometry.demands(lean_for)
     try:
-        key = None if where is None else content_key(source)
+        key = None if where is None else content_key(source, asked)
     except OSError:  # a file is missing: compiling says which
         key = None
     if where is None or key is None:
-        return source.compile()
+        return compiled_source(source, asked)
     with contextlib.suppress(SceneFileError):
         return read_scene(where, key)
-    scene = source.compile()
+    scene = compiled_source(source, asked)
     with contextlib.suppress(OSError):
         write_scene(where, key, scene)
     return scene
 
 
-def content_key(source: SceneSource) -> str:
+def compiled_source(source: SceneSource, asked: geometry.Demands | None) -> Scene:
+    """The scene with upstream's collision geoms, or with lean ones for what is asked of its things."""
+    return source.compile() if asked is None else geometry.lean_scene(source, asked)
+
+
+def content_key(source: SceneSource, asked: geometry.Demands | None = None) -> str:
     """Hash of everything that decides a scene's two files, 64 hexadecimal digits; independent of where assets lie.
+
+    Args:
+        source: the scene's source.
+        asked: what lean collision geoms are fitted for; None keeps upstream's.
 
     Raises:
         OSError: a file that the MJCF refers to cannot be read.
     """
     text = _FILE.sub(_by_content, source.xml)
     parts = [FORMAT, mujoco.__version__, _names(source), text]
+    if asked is not None:
+        parts.append(geometry.lean_key(asked))
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 

@@ -8,14 +8,12 @@ their start states, goals and instructions, which are data. Read ``vecenv/contra
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -28,6 +26,7 @@ from vecenv.contract import (
     Metrics,
     Objects,
     ObjectsSnapshot,
+    PlanControl,
     PointCloud,
     RegionBox,
     ResetInfo,
@@ -37,16 +36,22 @@ from vecenv.controllers import waypoint
 from vecenv.libero import fixtures as fixture_poses
 from vecenv.libero import goals, surface
 from vecenv.libero import settled as settled_starts
-from vecenv.libero.bddl import Problem
+from vecenv.libero.bddl import Problem, SceneKey
 from vecenv.libero.export import exported_tasks
+from vecenv.libero.geometry import PROFILES
 from vecenv.libero.scene import Scene
 from vecenv.libero.sources import Task, installed_tasks
 from vecenv.libero.suites import NUM_EPISODES
-from vecenv.physics.native import Group, NativePhysics, Start
+from vecenv.physics import budgets
+from vecenv.physics.base import Followed, Group, Physics, Ran, Start, Watcher
+from vecenv.physics.budgets import Budget
+from vecenv.physics.build import BACKENDS, make_physics
 
 # What LIBERO evaluations send while objects settle after a reset: no motion, gripper open.
 SETTLE_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 MAX_STEPS = 2500
+# Starts of a scene on which its memory on MJX is measured.
+_BUDGET_STARTS = 64
 
 
 class LiberoError(ValueError):
@@ -58,8 +63,10 @@ class LiberoConfig:
     """Options of a LIBERO batch.
 
     Attributes:
-        backend: ``"native"`` (MuJoCo in C threads).
-        geometry: ``"exact"``, upstream's collision geoms.
+        backend: ``"native"`` (MuJoCo on CPU threads, float64), ``"warp"`` (MJX on MuJoCo Warp: NVIDIA GPUs, or a CPU),
+            ``"jax"`` (MJX in pure JAX: any device), or ``"mjx"`` (warp on CUDA, jax elsewhere).
+        geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, fitted ones (``vecenv.libero.geometry``).
+        budget: contact and constraint memory on MJX; None measures the scene once and remembers it.
         fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), or name -> (pos [3] or [B, 3] in
             metres, quat wxyz [4] or [B, 4]), world frame.
         start: ``"settled"``, the stored init states after ten idle ticks under MuJoCo 3.3.0, shipped with the package,
@@ -68,22 +75,25 @@ class LiberoConfig:
             they do not count.
         max_steps: step budget of an episode in control ticks.
         seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode.
-        num_threads: C threads; None for one a core.
+        num_threads: threads of the native backend; None for one a core.
+        num_devices: GPUs (or other devices) that MJX spreads the slots over.
         waypoint: tolerances and speeds of ``step_ee_pose``.
     """
 
     backend: str = "native"
     geometry: str = "exact"
+    budget: Budget | None = None
     fixtures: str | Mapping[str, Any] = "center"
     start: str = "settled"
     settle_steps: int = 10
     max_steps: int = MAX_STEPS
     seed: int = 0
     num_threads: int | None = None
+    num_devices: int = 1
     waypoint: waypoint.WaypointConfig = field(default_factory=waypoint.WaypointConfig)
 
     def __post_init__(self) -> None:
-        for name, allowed in (("backend", ("native",)), ("geometry", ("exact",)), ("start", ("settled", "raw"))):
+        for name, allowed in (("backend", BACKENDS), ("geometry", PROFILES), ("start", ("settled", "raw"))):
             if getattr(self, name) not in allowed:
                 raise LiberoError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
         if self.start == "settled" and self.fixtures != "center":
@@ -96,33 +106,20 @@ class LiberoConfig:
             raise LiberoError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
 
 
-Watcher: TypeAlias = Callable[[np.ndarray, np.ndarray], None]
-_Servo: TypeAlias = Callable[..., tuple[np.ndarray, waypoint.Pose]]
+def _joined(starts: Sequence[Start]) -> Start:
+    """Settled starts of one scene, one after the other."""
 
+    def join(name: str) -> np.ndarray:
+        return np.concatenate([getattr(start, name) for start in starts])
 
-@functools.lru_cache(maxsize=8)
-def _servo(config: waypoint.WaypointConfig) -> tuple[_Servo, Callable[..., np.ndarray]]:
-    """The compiled servo: the action of a tick, held where asked, with the next reference; and who has arrived."""
-
-    @jax.jit
-    def tick(
-        current: waypoint.Pose, target: waypoint.Pose, grip: jax.Array, reference: waypoint.Pose, hold: jax.Array
-    ) -> tuple[jax.Array, waypoint.Pose]:
-        moving, ahead = waypoint.servo(current, target, grip, reference, config)
-        return jnp.where(hold[:, None], waypoint.hold_action(grip), moving), ahead
-
-    reached = jax.jit(functools.partial(waypoint.converged, config=config))
-
-    def run_tick(*args: Any) -> tuple[np.ndarray, waypoint.Pose]:
-        with jax.enable_x64(True):
-            actions, ahead = tick(*args)
-        return np.asarray(actions), ahead
-
-    def run_reached(*args: Any) -> np.ndarray:
-        with jax.enable_x64(True):
-            return np.asarray(reached(*args))
-
-    return run_tick, run_reached
+    return Start(
+        qpos=join("qpos"),
+        qvel=join("qvel"),
+        bodies=starts[0].bodies,
+        body_pos=join("body_pos"),
+        body_quat=join("body_quat"),
+        settled=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -152,7 +149,7 @@ class LiberoEnv:
         self.num_envs = len(placement)
         self._sources = tasks
         self._closed = False
-        self._physics: NativePhysics | None = None
+        self._physics: Physics | None = None
         self._watchers: list[Watcher] = []
         self._place(placement)
 
@@ -189,10 +186,7 @@ class LiberoEnv:
         indices = np.unique(self._placement.task)
         problems = {int(i): self._sources[i].problem() for i in indices}
         keys = list(dict.fromkeys(problem.scene_key() for problem in problems.values()))
-        scenes = []
-        for key in keys:
-            sharing = {i: problem for i, problem in problems.items() if problem.scene_key() == key}
-            scenes.append(self._sources[min(sharing)].scene(goals.contact_pairs(sharing.values())))
+        scenes = [self._scene(key, problems) for key in keys]
         fixture_poses.check_names(self.config.fixtures, scenes)
         self._tasks = {
             i: _TaskData(self._sources[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
@@ -200,8 +194,53 @@ class LiberoEnv:
         scene_of_slot = np.array([self._tasks[int(task)].scene for task in self._placement.task])
         if self._physics is None or not self._physics.serves(scenes, scene_of_slot):
             self._close_physics()
-            self._physics = NativePhysics(scenes, scene_of_slot, self.config.num_threads)
-        self._goals = [self._goal_table(group) for group in self._physics.groups]
+            self._physics = make_physics(
+                scenes,
+                scene_of_slot,
+                backend=self.config.backend,
+                geometry=self.config.geometry,
+                num_threads=self.config.num_threads,
+                num_devices=self.config.num_devices,
+                budgets=[self._budget_of(key, scene) for key, scene in zip(keys, scenes, strict=True)],
+            )
+        self._physics.set_goals([self._goal_table(group) for group in self._physics.groups])
+
+    def _scene(self, key: SceneKey, problems: Mapping[int, Problem]) -> Scene:
+        """The scene of this key, for those of the problems that share it."""
+        sharing = {i: problem for i, problem in problems.items() if problem.scene_key() == key}
+        lean_for = None
+        if self.config.geometry == "lean":
+            everywhere = (task.problem() for task in self._sources)
+            lean_for = tuple(problem for problem in everywhere if problem.scene_key() == key)
+        return self._sources[min(sharing)].scene(goals.contact_pairs(sharing.values()), lean_for)
+
+    def _budget_of(self, scene_key: SceneKey, scene: Scene) -> Budget | None:
+        """Memory on MJX: as configured, or measured on the starts of all the suite's tasks in the scene."""
+        if self.config.backend == "native" or self.config.budget is not None:
+            return self.config.budget
+        sharing = [i for i, task in enumerate(self._sources) if task.problem().scene_key() == scene_key]
+        each = -(-_BUDGET_STARTS // len(sharing))
+        episodes = np.linspace(0, NUM_EPISODES - 1, min(each, NUM_EPISODES)).astype(int)
+        return budgets.cached(scene, _joined([self._central_start(scene, i, episodes) for i in sharing]))
+
+    def _central_start(self, scene: Scene, task: int, episodes: np.ndarray) -> Start:
+        """Settled starts of a task, fixtures at the centre."""
+        source, starts = self._sources[task], self._sources[task].settled()
+        bodies, pos, quat = fixture_poses.poses(
+            source.problem(),
+            scene,
+            "center",
+            keys=[(self.config.seed, self.suite, task, int(episode)) for episode in episodes],
+            slots=list(range(len(episodes))),
+        )
+        return Start(
+            qpos=starts.qpos[episodes],
+            qvel=starts.qvel[episodes],
+            bodies=bodies,
+            body_pos=pos,
+            body_quat=quat,
+            settled=True,
+        )
 
     def _goal_table(self, group: Group) -> goals.GoalTable:
         tasks = self._placement.task[group.slots]
@@ -307,12 +346,9 @@ class LiberoEnv:
         """
         self._check_live()
         chunk, mended = action_space.continuous(actions, self.num_envs)
-        before, reward = self._steps.copy(), np.zeros(self.num_envs)
-        for k in range(chunk.shape[1]):
-            if self._done.all():
-                break
-            reward += self._tick(chunk[:, k], ~self._done)
-        return self._control(Control, reward, mended, before)
+        before = self._steps.copy()
+        ran = self.physics.run(chunk, ~self._done, self._ticks_left, self._watchers)
+        return self._control(Control, self._book(ran), mended, before)
 
     @contextmanager
     def watched(self, watcher: Watcher) -> Iterator[None]:
@@ -326,34 +362,21 @@ class LiberoEnv:
         finally:
             self._watchers.remove(watcher)
 
-    def _tick(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
-        """One control tick of the active slots; returns its rewards [B]."""
-        for watcher in self._watchers:
-            watcher(actions, active)
-        self.physics.control_step(actions, active)
-        self._steps[active] += 1
-        success = self._judge() & active
-        self._success[active] = success[active]
-        reward = success.astype(float)
-        self._reward += reward
-        self._terminated |= success
-        self._truncated |= active & ~success & (self._steps >= self.config.max_steps)
-        self._quarantine(active)
-        return np.where(self._success, reward, 0.0)
+    @property
+    def _ticks_left(self) -> np.ndarray:
+        return self.config.max_steps - self._steps
 
-    def _judge(self) -> np.ndarray:
-        """The goals on the kinematics and contacts that the last physics call left, bool [B]."""
-        verdict = np.zeros(self.num_envs, bool)
-        for group, table in zip(self.physics.groups, self._goals, strict=True):
-            verdict[group.slots] = goals.evaluate(
-                table,
-                xpos=group.xpos,
-                site_xpos=group.site_xpos,
-                site_xmat=group.site_xmat,
-                qpos=group.qpos,
-                touch=group.touch,
-            )
-        return verdict
+    def _book(self, ran: Ran) -> np.ndarray:
+        """Enter what the slots did; returns its rewards [B]."""
+        active = ran.ticks > 0
+        self._steps += ran.ticks
+        self._success[active] = ran.success[active]
+        self._terminated |= ran.success
+        self._truncated |= active & ~ran.success & (self._steps >= self.config.max_steps)
+        self._quarantine(active)
+        reward = np.where(active & self._success, 1.0, 0.0)
+        self._reward += reward
+        return reward
 
     def _quarantine(self, among: np.ndarray) -> None:
         for slot, reason in self.physics.faults.items():
@@ -395,37 +418,61 @@ class LiberoEnv:
         targets: Any
         targets, moves, errors = action_space.ee_poses(poses, self.num_envs)
         hold = action_space.hold_steps(hold_steps, self.num_envs)
-        before, reward = self._steps.copy(), np.zeros(self.num_envs)
-        servo, reached = _servo(self.config.waypoint)
-        target, grip = waypoint.Pose(targets[:, :3], targets[:, 3:7]), targets[:, 7]
-        limit = np.where(hold > 0, hold, self.config.waypoint.max_steps)
-        current = reference = self._eef()
-        active = moves & ~self._done
-        while active.any():
-            actions, reference = servo(current, target, grip, reference, hold > 0)
-            reward += self._tick(actions, active)
-            current = self._eef()
-            arrived = reached(current, target) & (hold == 0)
-            active &= ~self._done & ~arrived & (self._steps - before < limit)
+        before = self._steps.copy()
+        plan = waypoint.Plan(
+            waypoint.Pose(targets[:, None, :3], targets[:, None, 3:7]), targets[:, 7:], hold[:, None], moves[:, None]
+        )
+        followed = self._follow(plan)
         return self._control(
             EePoseControl,
-            reward,
+            self._book(followed),
             np.zeros(self.num_envs, bool),
             before,
-            converged=reached(current, target) & moves,
-            final_pose=np.concatenate(current, axis=1),
+            converged=followed.converged[:, 0] & moves,
+            final_pose=np.concatenate(self.physics.eef(), axis=1),
             step_count=self._steps - before,
             error=errors,
         )
 
-    def _eef(self) -> waypoint.Pose:
-        """End-effector position and hand orientation, world frame, as of the last physics call."""
-        pos: Any = np.zeros((self.num_envs, 3))
-        quat: Any = np.zeros((self.num_envs, 4))
-        for group in self.physics.groups:
-            pos[group.slots] = group.site_xpos[:, group.scene.grip_site]
-            quat[group.slots] = group.xquat[:, group.scene.hand_body]
-        return waypoint.Pose(pos, quat)
+    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
+        """Follow a plan of waypoints, each slot its own, in one call.
+
+        A slot goes from waypoint to waypoint as ``step_ee_pose`` does, without stopping, and ends at the end of its
+        plan, on success, when its budget is spent, or after ``max_misses`` waypoints in a row out of reach.
+
+        Args:
+            plan: anything with ``poses`` [B, T, 7] (xyz in metres, wxyz, world frame), ``grip`` [B, T] (1 closed, 0
+                open), ``hold`` int [B, T] (ticks without motion in place of the drive; 0 drives) and ``valid``
+                bool [B, T] (the others are skipped).
+            max_misses: None never gives up.
+
+        Raises:
+            ActionError: not numbers, or another shape.
+        """
+        self._check_live()
+        before = self._steps.copy()
+        checked, errors = action_space.plan(plan, self.num_envs)
+        followed = self._follow(checked, max_misses)
+        return self._control(
+            PlanControl,
+            self._book(followed),
+            np.zeros(self.num_envs, bool),
+            before,
+            converged=followed.converged,
+            waypoint_ticks=followed.waypoint_ticks,
+            final_pose=np.concatenate(self.physics.eef(), axis=1),
+            error=errors,
+        )
+
+    def _follow(self, plan: waypoint.Plan, max_misses: int | None = None) -> Followed:
+        return self.physics.follow(
+            plan,
+            ~self._done,
+            self._ticks_left,
+            self.config.waypoint,
+            max_misses=max_misses,
+            watchers=self._watchers,
+        )
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
@@ -501,12 +548,12 @@ class LiberoEnv:
         self._check_live()
         for group in self.physics.groups:
             group.refresh_all()
-        return self._judge()
+        return self.physics.judge()
 
     # -- physics state -------------------------------------------------------------------------------------------------
 
     @property
-    def physics(self) -> NativePhysics:
+    def physics(self) -> Physics:
         """The physics of the batch."""
         if self._physics is None:
             raise LiberoError("the environment is closed")

@@ -23,14 +23,15 @@ import numpy as np
 
 from vecenv.libero import goals, settled
 from vecenv.libero.bddl import Problem, SceneKey, parse_problem
-from vecenv.libero.cache import SceneFileError, content_key, read_scene, write_file, write_scene
+from vecenv.libero.cache import SceneFileError, compiled_source, content_key, read_scene, write_file, write_scene
+from vecenv.libero.geometry import PROFILES, demands
 from vecenv.libero.scene import Scene, scene_source
 from vecenv.libero.settled import SettledStarts
 from vecenv.libero.suites import TaskSpec, list_suites, list_tasks
 
 INDEX, SCENES, STARTS = "index.json", "scenes", "starts"
 # Layout of the folder; raised when it changes.
-FORMAT = 1
+FORMAT = 2
 
 Track: TypeAlias = Callable[[Sequence[Any], str], Iterable[Any]]
 
@@ -57,12 +58,19 @@ def _untracked(items: Sequence[Any], what: str) -> Sequence[Any]:
     return items
 
 
-def export(out: str | Path, suites: Sequence[str] | None = None, *, track: Track = _untracked) -> Exported:
+def export(
+    out: str | Path,
+    suites: Sequence[str] | None = None,
+    *,
+    geometries: Sequence[str] = ("exact",),
+    track: Track = _untracked,
+) -> Exported:
     """Write suites into a folder; one that an earlier export wrote is brought up to date.
 
     Args:
         out: the folder, created if need be.
         suites: which; all of them by default.
+        geometries: profiles of the collision geoms, see ``vecenv.libero.geometry``.
         track: called with a list of what is to be done and a word for it, returns it to iterate over: where a progress
             bar goes.
 
@@ -75,9 +83,15 @@ def export(out: str | Path, suites: Sequence[str] | None = None, *, track: Track
     folder = _writable(Path(out))
     tasks = {suite: list_tasks(suite) for suite in dict.fromkeys(list_suites() if suites is None else suites)}
     sharing: dict[SceneKey, list[Problem]] = {}
-    for spec in (spec for specs in tasks.values() for spec in specs):
-        sharing.setdefault(spec.problem().scene_key(), []).append(spec.problem())
-    ids = {key: _write_scene(folder, sharing[key]) for key in track(list(sharing), "scenes")}
+    in_suite: dict[tuple[str, SceneKey], list[Problem]] = {}
+    for problem, suite in ((spec.problem(), spec.suite) for specs in tasks.values() for spec in specs):
+        sharing.setdefault(problem.scene_key(), []).append(problem)
+        in_suite.setdefault((suite, problem.scene_key()), []).append(problem)
+    wanted = [(suite, key, profile) for suite, key in in_suite for profile in dict.fromkeys(geometries)]
+    ids = {
+        (suite, key, profile): _write_scene(folder, sharing[key], in_suite[suite, key] if profile == "lean" else None)
+        for suite, key, profile in track(wanted, "scenes")
+    }
     entries = {suite: _write_suite(folder, tasks[suite], ids) for suite in track(list(tasks), "starts")}
     index = {"format": FORMAT, "mujoco": mujoco.__version__, "suites": entries}
     write_file(folder / INDEX, json.dumps(index, indent=1).encode())
@@ -85,7 +99,7 @@ def export(out: str | Path, suites: Sequence[str] | None = None, *, track: Track
         folder=folder,
         suites=len(tasks),
         tasks=sum(map(len, tasks.values())),
-        scenes=len(ids),
+        scenes=len(set(ids.values())),
         size=sum(path.stat().st_size for path in _files(folder, tasks, ids.values())),
     )
 
@@ -103,19 +117,25 @@ def _writable(folder: Path) -> Path:
 
 
 def _files(folder: Path, suites: Iterable[str], ids: Iterable[str]) -> list[Path]:
-    scenes = [folder / SCENES / f"{key}{suffix}" for key in ids for suffix in (".mjb", ".json")]
+    scenes = [folder / SCENES / f"{key}{suffix}" for key in set(ids) for suffix in (".mjb", ".json")]
     return [folder / INDEX, *scenes, *(folder / STARTS / f"{suite}.npz" for suite in suites)]
 
 
-def _write_scene(folder: Path, problems: Sequence[Problem]) -> str:
-    """Write the scene these problems share; returns its id."""
+def _write_scene(folder: Path, problems: Sequence[Problem], lean_for: Sequence[Problem] | None) -> str:
+    """Write the scene these problems share, with lean geoms for some of them or upstream's; returns its id."""
     source = scene_source(problems[0], contact_pairs=goals.contact_pairs(problems))
-    scene, key = source.compile(), content_key(source)
-    write_scene(folder / SCENES, key, scene)
+    asked = None if lean_for is None else demands(lean_for)
+    key = content_key(source, asked)
+    try:
+        read_scene(folder / SCENES, key)
+    except SceneFileError:
+        write_scene(folder / SCENES, key, compiled_source(source, asked))
     return key
 
 
-def _write_suite(folder: Path, specs: Sequence[TaskSpec], ids: Mapping[SceneKey, str]) -> dict[str, Any]:
+def _write_suite(
+    folder: Path, specs: Sequence[TaskSpec], ids: Mapping[tuple[str, SceneKey, str], str]
+) -> dict[str, Any]:
     """Write the starts of a suite; returns its entry in the index."""
     arrays: dict[str, np.ndarray] = {}
     for spec in specs:
@@ -130,7 +150,11 @@ def _write_suite(folder: Path, specs: Sequence[TaskSpec], ids: Mapping[SceneKey,
         {
             "name": spec.name,
             "instruction": spec.instruction,
-            "scene_id": ids[spec.problem().scene_key()],
+            "scenes": {
+                profile: ids[spec.suite, spec.problem().scene_key(), profile]
+                for profile in PROFILES
+                if (spec.suite, spec.problem().scene_key(), profile) in ids
+            },
             "bddl": spec.bddl_path.read_text(encoding="utf-8-sig"),
         }
         for spec in specs
@@ -148,7 +172,7 @@ class ExportedTask:
     Attributes:
         suite, index, name, instruction: as in ``TaskSpec``.
         bddl: text of the task file.
-        scene_id: which of the folder's scenes it plays in.
+        scene_ids: which of the folder's scenes it plays in, by geometry profile.
         folder: the folder.
     """
 
@@ -157,7 +181,7 @@ class ExportedTask:
     name: str
     instruction: str
     bddl: str = field(repr=False)
-    scene_id: str
+    scene_ids: Mapping[str, str]
     folder: ExportFolder = field(repr=False)
 
     def problem(self) -> Problem:
@@ -177,9 +201,19 @@ class ExportedTask:
         arrays = self.folder.starts(self.suite)
         return SettledStarts(arrays[f"qpos_{self.index}"], arrays[f"qvel_{self.index}"])
 
-    def scene(self, contact_pairs: tuple[tuple[str, str], ...]) -> Scene:
-        """The compiled scene; it has the contact sensors of every exported task. Raises `ExportError`."""
-        return self.folder.scene(self.scene_id)
+    def scene(self, contact_pairs: tuple[tuple[str, str], ...], lean_for: tuple[Problem, ...] | None = None) -> Scene:
+        """The compiled scene; it has the contact sensors of every exported task.
+
+        Raises:
+            ExportError: the scene is damaged, or was not exported with this geometry.
+        """
+        profile = "exact" if lean_for is None else "lean"
+        if profile not in self.scene_ids:
+            raise ExportError(
+                f"{self.folder.path}: holds no {profile} scenes of {self.suite}; "
+                f"run `vecenv compile --out {self.folder.path} --geometry {profile}` again"
+            )
+        return self.folder.scene(self.scene_ids[profile])
 
 
 _parsed = functools.lru_cache(maxsize=512)(parse_problem)
@@ -271,8 +305,18 @@ class ExportFolder:
             raise ExportError(f"{self.path}: in layout {layout}, this vecenv reads layout {FORMAT}; {self._again}")
 
     def _tasks(self, suite: str, entry: Mapping[str, Any]) -> tuple[ExportedTask, ...]:
-        rows = [{key: str(task[key]) for key in ("name", "instruction", "bddl", "scene_id")} for task in entry["tasks"]]
-        return tuple(ExportedTask(suite=suite, index=i, **row, folder=self) for i, row in enumerate(rows))
+        return tuple(
+            ExportedTask(
+                suite=suite,
+                index=i,
+                name=str(task["name"]),
+                instruction=str(task["instruction"]),
+                bddl=str(task["bddl"]),
+                scene_ids={profile: str(key) for profile, key in task["scenes"].items()},
+                folder=self,
+            )
+            for i, task in enumerate(entry["tasks"])
+        )
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -331,16 +331,23 @@ def _joint_tests(table: GoalTable, qpos: Any, xp: Any) -> Any:
     return xp.where(table.joint_inclusive, value >= table.joint_bound, value > table.joint_bound)
 
 
+def _rotated(mat: Any, vector: Any, xp: Any) -> Any:
+    """``mat @ vector``, [..., 3]; a GPU may multiply matrices in TF32, off by a millimetre, so JAX sums by hand."""
+    if xp is np:
+        return (mat @ vector[..., None])[..., 0]
+    return xp.sum(mat * vector[..., None, :], axis=-1)
+
+
 def _in_region(pos: Any, frame_pos: Any, frame_mat: Any, size: Any, xp: Any) -> Any:
     """Upstream's ``in_box``: an axis-aligned box around the rotated half extents."""
-    extent = xp.abs((frame_mat @ size[..., None])[..., 0])
+    extent = xp.abs(_rotated(frame_mat, size, xp))
     below = xp.array([0.0, 0.0, _BOX_BELOW], dtype=extent.dtype)
     return xp.all((pos > frame_pos - extent - below) & (pos < frame_pos + extent), axis=-1)
 
 
 def _on_region(pos: Any, frame_pos: Any, frame_mat: Any, size: Any, xp: Any) -> Any:
     """Upstream's ``under``: within the footprint, just above the region."""
-    delta = (frame_mat @ (pos - frame_pos)[..., None])[..., 0]
+    delta = _rotated(frame_mat, pos - frame_pos, xp)
     height = delta[..., 2]
     top = size[..., 2]
     inside = xp.all(xp.abs(delta[..., :2]) < size[..., :2], axis=-1)

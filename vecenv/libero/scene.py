@@ -37,6 +37,9 @@ BASE_BODY = "robot0_base"
 # first 60 substeps of their starts with all fixtures in one place. A full arena is reported as a fault, never ignored.
 ARENA_MEMORY = "16M"
 
+# Custom numerics that MJX's pure-JAX implementation reads its limits from; -1 is none (``vecenv.physics.budgets``).
+CONTACT_LIMIT, PAIR_LIMIT = "max_contact_points", "max_geom_pairs"
+
 _ZONE_HALF_HEIGHT = 0.007
 
 
@@ -381,6 +384,9 @@ def _base() -> ET.Element:
     ET.SubElement(root, "size", {"memory": ARENA_MEMORY})
     visual = ET.SubElement(root, "visual")
     ET.SubElement(visual, "map", {"znear": "0.001"})
+    custom = ET.SubElement(root, "custom")
+    for name in (CONTACT_LIMIT, PAIR_LIMIT):
+        ET.SubElement(custom, "numeric", {"name": name, "data": "-1"})
     for tag in ("asset", "worldbody", "actuator", "sensor"):
         ET.SubElement(root, tag)
     return root

@@ -45,10 +45,14 @@ class Task(Protocol):
         """The init states at rest."""
         ...
 
-    def scene(self, contact_pairs: tuple[tuple[str, str], ...]) -> Scene:
-        """The compiled scene, with contact sensors for at least these pairs; the same object whenever it is the same.
+    def scene(self, contact_pairs: tuple[tuple[str, str], ...], lean_for: tuple[Problem, ...] | None = None) -> Scene:
+        """The compiled scene, the same object whenever it is the same.
 
         Tasks of one ``problem().scene_key()`` share a scene.
+
+        Args:
+            contact_pairs: things whose contacts its sensors count; it may have more.
+            lean_for: all tasks of the suite that share it, to fit lean collision geoms for; None keeps upstream's.
         """
         ...
 
@@ -81,9 +85,9 @@ class InstalledTask:
         """See `Task`."""
         return settled.load(self.spec)
 
-    def scene(self, contact_pairs: tuple[tuple[str, str], ...]) -> Scene:
+    def scene(self, contact_pairs: tuple[tuple[str, str], ...], lean_for: tuple[Problem, ...] | None = None) -> Scene:
         """See `Task`."""
-        return compiled(self.problem(), contact_pairs)
+        return compiled(self.problem(), contact_pairs, lean_for)
 
 
 def installed_tasks(suite: str) -> tuple[InstalledTask, ...]:
@@ -92,6 +96,8 @@ def installed_tasks(suite: str) -> tuple[InstalledTask, ...]:
 
 
 @functools.lru_cache(maxsize=64)
-def compiled(problem: Problem, contact_pairs: tuple[tuple[str, str], ...]) -> Scene:
+def compiled(
+    problem: Problem, contact_pairs: tuple[tuple[str, str], ...], lean_for: tuple[Problem, ...] | None = None
+) -> Scene:
     """A problem's scene, the same object for the same arguments."""
-    return cached_scene(problem, contact_pairs=contact_pairs)
+    return cached_scene(problem, contact_pairs=contact_pairs, lean_for=lean_for)

@@ -1,0 +1,183 @@
+"""Control steps a second on MJX, controller and verdicts included, against a bare loop of ``mjx.step`` in the same run.
+
+For every scene, geometry and batch size: the environment runs chunks of random actions; the bare loop steps the same
+number of substeps from the same states, with the last commands held and the same memory. Both are compiled; the two
+take turns. Also: seconds to compile, device memory, and how many worlds ran out of contact or constraint memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import report
+from jax import lax
+from mujoco import mjx
+
+import vecenv
+from vecenv.libero.env import LiberoEnv
+from vecenv.physics.base import SUBSTEPS
+from vecenv.physics.mjx import MjxGroup, jit
+
+CHUNK = 10
+
+
+def main() -> None:
+    """Measure what the command line asks for."""
+    options = arguments()
+    rows: list[dict[str, Any]] = []
+    cases = itertools.product(options.scene, options.geometry, options.batch)
+    for scene, geometry, batch in cases:
+        try:
+            rows.append(measure(scene, geometry, batch, options))
+        except Exception as error:
+            if "RESOURCE_EXHAUSTED" not in str(error) and "out of memory" not in str(error).lower():
+                raise
+            rows.append(
+                {**dict.fromkeys(rows[0] if rows else (), "-"), "scene": scene, "geometry": geometry, "B": batch}
+            )
+            print(f"{scene} {geometry} B={batch}: out of memory", flush=True)
+        print(rows[-1], flush=True)
+    report(options.name, rows, title="MJX: control steps a second", notes={"device": str(jax.devices()[0])})
+
+
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--scene", nargs="+", default=["libero_object/0", "libero_spatial/0"], help="suite/task")
+    parser.add_argument("--geometry", nargs="+", default=["exact", "lean"])
+    parser.add_argument("--backend", default="mjx")
+    parser.add_argument("--batch", nargs="+", type=int, default=[64])
+    parser.add_argument("--devices", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each side a round")
+    parser.add_argument("--scenes", help="folder that `vecenv compile` wrote")
+    parser.add_argument("--name", default="mjx", help="name of the results file")
+    return parser.parse_args()
+
+
+def measure(scene: str, geometry: str, batch: int, options: argparse.Namespace) -> dict[str, Any]:
+    """One row."""
+    suite, task = scene.rsplit("/", 1)
+    episodes = [i % 50 for i in range(batch)]
+    before = used_memory()
+    start = time.perf_counter()
+    env = vecenv.make(
+        suite,
+        task=int(task),
+        episodes=episodes,
+        backend=options.backend,
+        geometry=geometry,
+        num_devices=options.devices,
+        scenes=options.scenes,
+    )
+    env.reset()
+    ready = time.perf_counter() - start
+    assert isinstance(env, LiberoEnv)
+    group: MjxGroup = env.physics.groups[0]
+    ours, compile_seconds = timed_first(environment(group))
+    memory = used_memory() - before
+    theirs, _ = timed_first(bare(group)) if options.devices == 1 else (None, 0.0)
+    rates = alternate([ours, theirs], options.rounds, options.seconds)
+    failed = int((np.asarray(group.worlds.fault) != 0).sum())
+    row = {
+        "scene": scene,
+        "geometry": geometry,
+        "impl": group.built.impl,
+        "geoms": int(
+            (np.asarray(group.scene.model.geom_contype) | np.asarray(group.scene.model.geom_conaffinity) > 0).sum()
+        ),
+        "B": batch,
+        "devices": options.devices,
+        "env / bare": round(rates[0] / rates[1], 3) if rates[1] else "-",
+        "env steps/s": round(rates[0] * batch * CHUNK),
+        "bare steps/s": round(rates[1] * batch * CHUNK) if rates[1] else "-",
+        "ready s": round(ready, 1),
+        "compile s": round(compile_seconds, 1),
+        "MiB a world": round(memory / batch, 2) if memory else "-",
+        "faults": failed,
+    }
+    env.close()
+    return row
+
+
+def environment(group: MjxGroup) -> Callable[[], Any]:
+    """Run a chunk: a random action held for some ticks, then its opposite; the state goes on from call to call."""
+    n = len(group.slots)
+    there = np.random.default_rng(0).uniform(-1, 1, (n, 1, 7))
+    actions = np.concatenate([np.repeat(there, CHUNK // 2, axis=1), np.repeat(-there, CHUNK // 2, axis=1)], axis=1)
+    chunk, active, limit = group.put(actions), group.put_mask(np.ones(n, bool)), group.put(np.full(n, 10**6))
+
+    def run() -> Any:
+        assert group.table is not None
+        loop = group.compiled.run(group.built.system, group.table, group.worlds, chunk, active, limit)
+        group.replace(loop.worlds)
+        return loop.ticks
+
+    return run
+
+
+def bare(group: MjxGroup) -> Callable[[], Any]:
+    """Step the physics alone from the same states, commands held."""
+    step = jax.vmap(mjx.step, in_axes=(None, 0))
+
+    def many(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        return lax.scan(lambda d, _: (step(model, d), None), data, None, length=SUBSTEPS * CHUNK)[0]
+
+    compiled = jit(many, donate_argnums=(1,))
+    state = [jax.tree.map(jnp.copy, group.worlds.data)]
+
+    def run() -> Any:
+        state[0] = compiled(group.built.system.model, state[0])
+        return state[0].qpos
+
+    return run
+
+
+def timed_first(run: Callable[[], Any]) -> tuple[Callable[[], Any], float]:
+    """The function, and the seconds its first call takes beyond its second."""
+    seconds = []
+    for _ in range(2):
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - start)
+    return run, max(seconds[0] - seconds[1], 0.0)
+
+
+def alternate(runs: list[Callable[[], Any] | None], rounds: int, seconds: float) -> list[float]:
+    """Calls a second of each, the median over the rounds."""
+    found: list[list[float]] = [[] for _ in runs]
+    for _ in range(rounds):
+        for run, rates in zip(runs, found, strict=True):
+            if run is not None:
+                rates.append(rate(run, seconds))
+    return [statistics.median(rates) if rates else 0.0 for rates in found]
+
+
+def rate(run: Callable[[], Any], seconds: float) -> float:
+    """Calls a second over at least so many seconds."""
+    start, calls, elapsed = time.perf_counter(), 0, 0.0
+    while elapsed < seconds:
+        jax.block_until_ready(run())
+        calls, elapsed = calls + 1, time.perf_counter() - start
+    return calls / elapsed
+
+
+def used_memory() -> float:
+    """MiB in use on the first device; 0 where nobody says."""
+    if jax.devices()[0].platform == "cpu":
+        return 0.0
+    query = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits"]
+    return float(subprocess.run(query, capture_output=True, text=True, check=True).stdout.split()[0])
+
+
+if __name__ == "__main__":
+    main()
