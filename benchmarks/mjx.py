@@ -118,7 +118,7 @@ def environment(group: MjxGroup) -> Callable[[], Any]:
 
     def run() -> Any:
         assert group.table is not None
-        loop = group.compiled.run(group.built.system, group.table, group.worlds, chunk, active, limit)
+        loop = group.compiled.run(group.system, group.table, group.worlds, chunk, active, limit)
         group.replace(loop.worlds)
         return loop.ticks
 
@@ -132,12 +132,10 @@ def bare(group: MjxGroup) -> Callable[[], Any]:
     def many(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         return lax.scan(lambda d, _: (step(model, d), None), data, None, length=SUBSTEPS * CHUNK)[0]
 
-    compiled = jit(many, donate_argnums=(1,))
-    state = [jax.tree.map(jnp.copy, group.worlds.data)]
+    compiled, start = jit(many), jax.tree.map(jnp.copy, group.worlds.data)
 
     def run() -> Any:
-        state[0] = compiled(group.built.system.model, state[0])
-        return state[0].qpos
+        return compiled(group.system.model, start).qpos
 
     return run
 

@@ -4,17 +4,68 @@ physics our controllers are tried on."""
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import mujoco
 import numpy as np
 
-from vecenv.controllers import osc
+from vecenv.controllers.osc import ArmState, OscGoal
+from vecenv.controllers.osc_numba import ARM_FIELDS, ARM_SIZE, ArmViews, Controllers
 from vecenv.controllers.rotations import mat_to_quat
 from vecenv.controllers.waypoint import Pose
 
 JOINTS = 7
 SUBSTEPS = 25
+# Where a row's fields end, and all but the bias torques: what robosuite's controller keeps of the arm it last saw.
+_ENDS = np.cumsum(list(ARM_FIELDS.values()))
+_KEPT = ARM_SIZE - ARM_FIELDS["bias"]
+
+
+def views_of(rows: np.ndarray, ctrl: np.ndarray) -> ArmViews:
+    """Arms held in rows, [n, 103 or more], as live views, with commands [n, 9]."""
+    fields = np.split(rows[:, :ARM_SIZE], _ENDS[:-1], axis=1)
+    return ArmViews(**dict(zip(ARM_FIELDS, fields, strict=True)), ctrl=ctrl)
+
+
+def arm_from_rows(rows: np.ndarray) -> ArmState:
+    """The arm as the JAX controller takes it, NumPy arrays [..., *], from rows [..., 103]."""
+    qpos, qvel, pos, mat, anchor, axis, lower, bias = np.split(rows, _ENDS[:-1], axis=-1)
+    batch = rows.shape[:-1]
+    axis, lever = axis.reshape(*batch, JOINTS, 3), pos[..., None, :] - anchor.reshape(*batch, JOINTS, 3)
+    jacobian = np.swapaxes(np.concatenate([np.cross(axis, lever), axis], axis=-1), -1, -2)
+    mass, (row, column) = np.zeros((*batch, JOINTS, JOINTS)), np.tril_indices(JOINTS)
+    mass[..., row, column] = mass[..., column, row] = lower
+    arrays: Any = (qpos, qvel, pos, mat.reshape(*batch, 3, 3), jacobian, mass, bias)
+    return ArmState(*arrays)
+
+
+def goal_of(pos: Any, mat: Any) -> OscGoal:
+    """A goal that keeps NumPy's float64 until it is used."""
+    return OscGoal(pos, mat)
+
+
+def believed(rows: np.ndarray, home: np.ndarray) -> np.ndarray:
+    """Rows [..., 103] as a controller sees them that still believes to be ``home``, [103]: only the bias is live."""
+    return np.concatenate([np.broadcast_to(home[:_KEPT], (*rows.shape[:-1], _KEPT)), rows[..., _KEPT:]], axis=-1)
+
+
+class Rollout(NamedTuple):
+    """What robosuite's robot saw and commanded in T control ticks from a loaded state.
+
+    Attributes:
+        home: the arm its controller was loaded with, [103].
+        actions: [T, 7].
+        rows: the arm before each substep, [T, 25, 103].
+        ctrl: actuator commands of each substep, [T, 25, 9].
+        goals: pose its controller aimed at in each tick, [T, ...].
+    """
+
+    home: np.ndarray
+    actions: np.ndarray
+    rows: np.ndarray
+    ctrl: np.ndarray
+    goals: OscGoal
 
 
 class RobosuitePeer:
@@ -61,8 +112,8 @@ class RobosuitePeer:
     def data(self) -> Any:
         return self.env.sim.data._data
 
-    def packed(self, data: Any = None) -> np.ndarray:
-        """The arm as one packed row, [103], from data that ``mj_forward`` has run on."""
+    def row(self, data: Any = None) -> np.ndarray:
+        """The arm as one row, [103] in the order of ``ARM_FIELDS``, from data that ``mj_forward`` has run on."""
         data = self.data if data is None else data
         site, joints = self.robot.eef_site_id, list(self.controller.joint_index)
         mass = np.zeros((self.model.nv, self.model.nv))
@@ -73,12 +124,12 @@ class RobosuitePeer:
         frames = [data.xanchor[joints].ravel(), data.xaxis[joints].ravel()]
         return np.concatenate([*arm, *frames, lower, data.qfrc_bias[dofs]])
 
-    def home_packed(self) -> np.ndarray:
+    def home_row(self) -> np.ndarray:
         """The arm robosuite's controller sees when it is loaded: at ``init_qpos``, at rest, fingers still at 0."""
         data = mujoco.MjData(self.model)
         data.qpos[self.controller.qpos_index] = self.robot.init_qpos
         mujoco.mj_forward(self.model, data)
-        return self.packed(data)
+        return self.row(data)
 
     def place_arm(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Put the arm somewhere, refresh the controller and set its goal to the pose there."""
@@ -88,6 +139,46 @@ class RobosuitePeer:
         self.controller.update(force=True)
         self.controller.reset_goal()
 
+    def rollout(self, ticks: int) -> Rollout:
+        """Reset, load a state that is not the home pose as ``set_init_state`` does, act, and record every substep.
+
+        Actions are random, out of range at times, with ticks that do not rotate and ticks that do nothing.
+        """
+        self._load_displaced_state()
+        actions = np.random.default_rng(3).uniform(-1.2, 1.2, (ticks, 7))
+        actions[1::4, 3:6] = 0
+        actions[2::7, 3:5] = 0
+        actions[9::10] = 0
+        return self._record(actions)
+
+    def _load_displaced_state(self) -> None:
+        self.env.reset()
+        state = self.env.sim.get_state().flatten()
+        state[1:8] += [0.03, -0.02, 0.02, 0.01, -0.03, 0.02, 0.03]
+        self.env.sim.set_state_from_flattened(state)
+        self.env.sim.forward()
+        assert not self.controller.new_update  # it is not told of a loaded state
+
+    def _record(self, actions: np.ndarray) -> Rollout:
+        rows, ctrl, first, goals = [], [], [], []
+        robot, controller = self.robot, self.controller
+        original = robot.control
+
+        def control(action: np.ndarray, policy_step: bool = False) -> None:
+            rows.append(self.row())
+            original(action, policy_step=policy_step)
+            ctrl.append(self.data.ctrl.copy())
+            first.append(policy_step)
+
+        with patch.object(robot, "control", control):
+            for action in actions:
+                self.env.step(action)
+                goals.append((np.array(controller.goal_pos), np.array(controller.goal_ori)))
+        assert np.flatnonzero(first).tolist() == list(range(0, len(first), SUBSTEPS))
+        pos, mat = map(np.array, zip(*goals, strict=True))
+        seen, commanded = (np.array(x).reshape(len(actions), SUBSTEPS, -1) for x in (rows, ctrl))
+        return Rollout(self.home_row(), actions, seen, commanded, goal_of(pos, mat))
+
 
 class OurArm:
     """The peer's simulation driven by our controllers instead of robosuite's."""
@@ -95,21 +186,23 @@ class OurArm:
     def __init__(self, peer: RobosuitePeer) -> None:
         peer.env.reset()
         self.peer = peer
-        self.controllers = osc.compile_substeps()
-        self.state = self.controllers.start(peer.home_packed()[None])
+        self._rows = np.zeros((1, ARM_SIZE))
+        self._views = views_of(self._rows, np.zeros((1, JOINTS + 2)))
+        self._controllers = Controllers(self._views, peer.home_row())
+        self._controllers.rearm(np.arange(1), fresh=False)
 
     def tick(self, action: np.ndarray) -> None:
         """One control tick of a 7-D action."""
+        model, data, everyone = self.peer.model, self.peer.data, np.ones(1, bool)
         for substep in range(SUBSTEPS):
-            mujoco.mj_forward(self.peer.model, self.peer.data)
-            packed = self.peer.packed()[None]
+            mujoco.mj_forward(model, data)
+            self._rows[0] = self.peer.row()
             if substep == 0:
-                ctrl, self.state = self.controllers.begin(self.state, packed, action[None], np.zeros(1, bool))
-            else:
-                ctrl, self.state = self.controllers.proceed(self.state, packed)
-            self.peer.data.ctrl[:] = ctrl[0]
-            mujoco.mj_step(self.peer.model, self.peer.data)
-        mujoco.mj_forward(self.peer.model, self.peer.data)
+                self._controllers.take_actions(action[None].astype(np.float64), everyone)
+            self._controllers.command(everyone)
+            data.ctrl[:] = self._views.ctrl[0]
+            mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
 
     def pose(self) -> Pose:
         """Pose of the grip site."""

@@ -151,7 +151,8 @@ def test_a_folder_may_be_given_as_text(exported: Path) -> None:
 
 
 def the_scene(folder: Path) -> Path:
-    return folder / "scenes" / f"{ExportFolder(folder).tasks('libero_goal')[0].scene_ids["exact"]}.mjb"
+    (task, *_) = ExportFolder(folder).tasks("libero_goal")
+    return folder / "scenes" / f"{task.scene_ids['exact']}.mjb"
 
 
 def edit_index(**changes: Any) -> Callable[[Path], None]:

@@ -1,10 +1,10 @@
-"""The native backend's controllers against the JAX ones, and what they remember."""
+"""The native backend's controllers against robosuite's and the JAX ones, and what they remember."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 from numba import types
+from robosuite_peer import RobosuitePeer, Rollout, arm_from_rows, believed, views_of
 
 from vecenv.controllers import gripper, osc, osc_numba
 from vecenv.controllers.gripper import GripperConfig
@@ -21,10 +22,16 @@ from vecenv.controllers.osc import OscConfig
 from vecenv.controllers.osc_numba import ArmViews, Controllers
 from vecenv.libero.scene import Scene, compile_scene
 from vecenv.libero.suites import task
+from vecenv.physics import mjx
 from vecenv.physics.native import arm_views, home_row
 
 COUNT = 1000
 EVERYONE = np.ones(COUNT, bool)
+# Parity does not need LLVM's optimisation, and things compile several times faster without.
+OPTIONS: dict[str, Any] = {**mjx.compiler_options(), "xla_backend_optimization_level": 0}
+jax_set_goal, jax_torques = (
+    partial(jax.jit, static_argnames="config", compiler_options=OPTIONS)(f) for f in (osc.set_goal, osc.torques)
+)
 
 
 @pytest.fixture(scope="module")
@@ -61,29 +68,16 @@ def actions(count: int = COUNT, seed: int = 1) -> np.ndarray:
     return chosen
 
 
-def controllers(arms: np.ndarray, home: np.ndarray, *, fresh: bool = False, **configs: Any) -> tuple[Controllers, Any]:
-    """Controllers over a copy of these arms, with the fields as writable arrays; their goals are near the arms."""
-    ends = np.cumsum(list(osc_numba.ARM_FIELDS.values()))
-    columns = zip(osc_numba.ARM_FIELDS.items(), ends, strict=True)
+def controllers(
+    arms: np.ndarray, home: np.ndarray, *, fresh: bool = False, **configs: Any
+) -> tuple[Controllers, ArmViews]:
+    """Controllers over a copy of these arms, with the arrays they read and write; their goals are at home."""
     # Rows of a simulator are wider than what is read of them.
     wide = np.concatenate([arms, np.zeros((len(arms), 20))], axis=1)
-    fields = {name: wide[:, end - width : end] for (name, width), end in columns}
-    fields["ctrl"] = wide[:, -9:]
-    made = Controllers(ArmViews(**fields), home, **configs)
+    views = views_of(wide, wide[:, -9:])
+    made = Controllers(views, home, **configs)
     made.rearm(np.arange(len(arms)), fresh=fresh)
-    return made, SimpleNamespace(**fields)
-
-
-def jax_arm(rows: np.ndarray) -> osc.ArmState:
-    """The arm the JAX controllers see, [n, ...], from rows."""
-    ends = np.cumsum(list(osc_numba.ARM_FIELDS.values()))
-    qpos, qvel, pos, mat, anchor, axis, lower, bias = np.split(rows, ends[:-1], axis=1)
-    axis, lever = axis.reshape(-1, 7, 3), pos[:, None] - anchor.reshape(-1, 7, 3)
-    jacobian = np.concatenate([np.cross(axis, lever), axis], axis=2).transpose(0, 2, 1)
-    mass = np.zeros((len(rows), 7, 7))
-    row, column = np.tril_indices(7)
-    mass[:, row, column] = mass[:, column, row] = lower
-    return osc.ArmState(*map(jnp.asarray, (qpos, qvel, pos, mat.reshape(-1, 3, 3), jacobian, mass, bias)))
+    return made, views
 
 
 class Expected(NamedTuple):
@@ -106,9 +100,9 @@ def expected(
     """One substep: new goals, torques and finger targets."""
     config, hand = configs.get("config", osc.OSC_POSE), configs.get("gripper", gripper.PANDA_GRIPPER)
     with double():
-        state = jax_arm(arm)
-        goal = osc.set_goal(state, goal, action[:, :6], config)
-        torque = osc.torques(state, goal, home[:7], config)
+        state = arm_from_rows(arm)
+        goal = jax_set_goal(state, goal, action[:, :6], config=config)
+        torque = jax_torques(state, goal, home[:7], config=config)
         targets = gripper.integrate(jnp.asarray(fingers), jnp.asarray(action[:, 6]), hand)
         ctrl = jnp.concatenate([torque, gripper.command(targets, hand)], axis=1)
         return Expected(goal, np.asarray(ctrl), np.asarray(targets))
@@ -124,14 +118,12 @@ def relative_error(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.abs(found - wanted).max(-1) / np.abs(wanted).max(-1)
 
 
-# Parity -------------------------------------------------------------------------------------------------------------
+# Parity with JAX ----------------------------------------------------------------------------------------------------
 
 
 def test_the_arms_include_nearly_singular_ones(arms: np.ndarray) -> None:
-    with double():
-        arm = jax.tree.map(np.asarray, jax_arm(arms))
-    inverse = arm.jacobian @ np.linalg.inv(arm.mass_matrix) @ arm.jacobian.transpose(0, 2, 1)
-    assert np.linalg.cond(inverse).max() > 1e8
+    jacobian, mass = map(np.asarray, arm_from_rows(arms)[4:6])
+    assert np.linalg.cond(jacobian @ np.linalg.inv(mass) @ jacobian.transpose(0, 2, 1)).max() > 1e8
 
 
 def test_goals_and_controls_equal_those_of_the_jax_controllers(arms: np.ndarray, home: np.ndarray) -> None:
@@ -184,14 +176,55 @@ def test_views_of_a_batch_follow_its_simulations(scene: Scene, home: np.ndarray)
     np.testing.assert_array_equal(batch.bind("ctrl"), np.tile(np.arange(9.0), (3, 1)))
 
 
+# Parity with robosuite ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rollout() -> Rollout:
+    return RobosuitePeer().rollout(40)
+
+
+def test_ticks_equal_robosuites_along_a_rollout_from_a_loaded_state(rollout: Rollout) -> None:
+    """Goals, torques and finger targets of 1,000 substeps, from the first, when robosuite believes the arm at home."""
+    rows, one = rollout.rows[0, :1].copy(), np.ones(1, bool)
+    views = views_of(rows, np.zeros((1, 9)))
+    made, found = Controllers(views, rollout.home), []
+    for tick, action in enumerate(rollout.actions):
+        for substep, row in enumerate(rollout.rows[tick]):
+            rows[0] = row
+            if substep == 0:
+                made.take_actions(action[None], one)
+                np.testing.assert_allclose(made.memory["goal_pos"][0], rollout.goals.pos[tick], rtol=0, atol=1e-15)
+                np.testing.assert_allclose(
+                    made.memory["goal_mat"].reshape(3, 3), rollout.goals.mat[tick], rtol=0, atol=1e-15
+                )
+            made.command(one)
+            found.append(views.ctrl[0].copy())
+    ctrl = rollout.ctrl.reshape(-1, 9)
+    assert relative_error(np.array(found), ctrl).max() < 1e-9
+    np.testing.assert_allclose(np.array(found)[:, 7:], ctrl[:, 7:], rtol=0, atol=1e-15)
+    assert np.abs(np.diff(ctrl[:, 7])).max() > 0
+
+
+def test_only_the_arm_of_the_reset_explains_robosuites_first_substep(rollout: Rollout) -> None:
+    """Its controller is not told of a loaded state until it has run once; the bias torques alone are live."""
+    errors = []
+    for fresh in (True, False):
+        made, views = controllers(rollout.rows[0, :1], rollout.home, fresh=fresh)
+        made.take_actions(rollout.actions[:1], np.ones(1, bool))
+        made.command(np.ones(1, bool))
+        errors.append(relative_error(views.ctrl, rollout.ctrl[0, :1]).max())
+    assert errors[0] < 1e-9
+    assert errors[1] > 1e-2
+
+
 # Memory -------------------------------------------------------------------------------------------------------------
 
 
 def test_the_first_substep_of_a_fresh_slot_uses_the_arm_of_the_reset(arms: np.ndarray, home: np.ndarray) -> None:
     """Goal and torques come from home, only the bias torques from the simulator; the next substep sees the arm."""
     made, fields = controllers(arms, home, fresh=True)
-    believed = np.concatenate([np.tile(home[:96], (COUNT, 1)), arms[:, 96:]], axis=1)
-    first = expected(believed, goals_of(made), actions(), home, np.zeros((COUNT, 2)))
+    first = expected(believed(arms, home), goals_of(made), actions(), home, np.zeros((COUNT, 2)))
     made.take_actions(actions(), EVERYONE)
     made.command(EVERYONE)
     assert relative_error(fields.ctrl, first.ctrl).max() < 1e-9
@@ -199,7 +232,7 @@ def test_the_first_substep_of_a_fresh_slot_uses_the_arm_of_the_reset(arms: np.nd
     assert not made.memory["fresh"].any()
     made.command(EVERYONE)
     with double():
-        torque = osc.torques(jax_arm(arms), first.goal, home[:7])
+        torque = jax_torques(arm_from_rows(arms), first.goal, home[:7], config=osc.OSC_POSE)
     assert relative_error(fields.ctrl[:, :7], np.asarray(torque)).max() < 1e-9
 
 
@@ -295,11 +328,11 @@ def test_arrays_that_do_not_fit_are_named(arms: np.ndarray, home: np.ndarray) ->
         made.take_actions(np.zeros((2, 7), np.float32), np.ones(2, bool))
     with pytest.raises(ValueError, match=r"active must be bool \[2\], got bool \[3\]"):
         made.command(np.ones(3, bool))
-    views = ArmViews(**{**vars(fields), "bias": np.zeros((2, 6))})
+    views = fields._replace(bias=np.zeros((2, 6)))
     with pytest.raises(ValueError, match=r"bias must be float64 \[2, 7\], got float64 \[2, 6\]"):
         Controllers(views, home)
     with pytest.raises(ValueError, match=r"home must be float64 \[103\], got float64 \[7\]"):
-        Controllers(ArmViews(**vars(fields)), home[:7])
+        Controllers(fields, home[:7])
 
 
 def test_code_that_no_cache_can_hold_is_compiled_all_the_same() -> None:

@@ -14,7 +14,7 @@ velocities and accelerations are running sums out along the chain, composite ine
 are a product, formed in three steps. The fingers hang on the last link: they count as two more bodies behind it.
 
 Nothing calls a matrix product, which accelerators may round to TF32. Bodies and components are leading axes inside, and
-everything is elementwise over the batch. On a CPU the work is cut into stages as the controller's is, see ``osc``.
+everything is elementwise over the batch. On a CPU the work is cut into stages, see ``_batch_last``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ import mujoco
 import numpy as np
 from jax.typing import ArrayLike
 
-from vecenv.controllers.osc import NUM_JOINTS, ArmState, _cross, _fenced_on_cpu, _stage, _sum_rows
+from vecenv.controllers._batch_last import cross, fenced_on_cpu, stage, sum_rows
+from vecenv.controllers.osc import NUM_JOINTS, ArmState
 from vecenv.controllers.rotations import require_tail
 from vecenv.libero.scene import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, HAND_BODY
 
@@ -200,7 +201,7 @@ def arm_state(chain: Chain, qpos: ArrayLike, qvel: ArrayLike) -> ArmState:
     qpos, qvel = jnp.broadcast_arrays(_checked("qpos", qpos), _checked("qvel", qvel))
     dtype = jnp.result_type(qpos, qvel)
     qpos, qvel = qpos.astype(dtype), qvel.astype(dtype)
-    found = _fenced_on_cpu(_arm_last, _constants(chain, qpos), jnp.moveaxis(qpos, -1, 0), jnp.moveaxis(qvel, -1, 0))
+    found = fenced_on_cpu(_arm_last, _constants(chain, qpos), jnp.moveaxis(qpos, -1, 0), jnp.moveaxis(qvel, -1, 0))
     return ArmState(qpos[..., :NUM_JOINTS], qvel[..., :NUM_JOINTS], *map(_batch_first, found, (1, 2, 2, 2, 1)))
 
 
@@ -219,7 +220,7 @@ def hand_pose(chain: Chain, qpos: ArrayLike) -> tuple[jax.Array, jax.Array]:
         ValueError: a shape does not match.
     """
     qpos = _checked("qpos", qpos)
-    pos, quat = _fenced_on_cpu(_hand_last, _constants(chain, qpos), jnp.moveaxis(qpos, -1, 0))
+    pos, quat = fenced_on_cpu(_hand_last, _constants(chain, qpos), jnp.moveaxis(qpos, -1, 0))
     return _batch_first(pos, 1), _batch_first(quat, 1)
 
 
@@ -242,7 +243,7 @@ def _batch_first(x: jax.Array, tail: int) -> jax.Array:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Arrays are [components, bodies, ...batch] from here on, in world axes, seen from the first hinge. Twists and forces
-# are 6-vectors, the angular part first. The work is cut into stages, see ``osc._stage``.
+# are 6-vectors, the angular part first. The work is cut into stages, see ``_batch_last``.
 
 
 class _Frames(NamedTuple):
@@ -269,27 +270,27 @@ class _Inertias(NamedTuple):
 
 def _hand_last(chain: Chain, qpos: jax.Array, *, fence: bool) -> tuple[jax.Array, jax.Array]:
     """Position of the site and orientation of the hand."""
-    turns = _stage(fence, _hinge_quats, chain, qpos)
-    turn = reduce(partial(_stage, fence, _quat_product), [turns[:, i] for i in range(NUM_JOINTS)])
+    turns = stage(fence, _hinge_quats, chain, qpos)
+    turn = reduce(partial(stage, fence, _quat_product), [turns[:, i] for i in range(NUM_JOINTS)])
     return chain.base + _frames(chain, qpos, fence).eef, _quat_product(turn, chain.hand_quat)
 
 
 def _arm_last(chain: Chain, qpos: jax.Array, qvel: jax.Array, *, fence: bool) -> tuple[jax.Array, ...]:
     """Position and orientation of the site, Jacobian, mass matrix and bias."""
     frames = _frames(chain, qpos, fence)
-    pos, mat, jacobian, screws = _stage(fence, _site, chain, frames)
-    inertias = _stage(fence, _inertias, chain, frames, qpos)
-    mass_matrix = _stage(fence, _mass_matrix, chain, screws, inertias)
-    twist, added = _stage(fence, _twists, chain, frames, screws, qvel)
-    force = _stage(fence, _forces, chain, inertias, twist, added)
-    return pos, mat, jacobian, mass_matrix, _stage(fence, _project, screws, force)
+    pos, mat, jacobian, screws = stage(fence, _site, chain, frames)
+    inertias = stage(fence, _inertias, chain, frames, qpos)
+    mass_matrix = stage(fence, _mass_matrix, chain, screws, inertias)
+    twist, added = stage(fence, _twists, chain, frames, screws, qvel)
+    force = stage(fence, _forces, chain, inertias, twist, added)
+    return pos, mat, jacobian, mass_matrix, stage(fence, _project, screws, force)
 
 
 def _frames(chain: Chain, qpos: jax.Array, fence: bool) -> _Frames:
-    mat = _stage(fence, _hinge_mats, chain, qpos)
+    mat = stage(fence, _hinge_mats, chain, qpos)
     for reach in (1, 2, 4):
-        mat = _stage(fence, partial(_compose, reach=reach), mat)
-    return _stage(fence, _place, chain, mat)
+        mat = stage(fence, partial(_compose, reach=reach), mat)
+    return stage(fence, _place, chain, mat)
 
 
 def _hinge_mats(chain: Chain, qpos: jax.Array) -> jax.Array:
@@ -300,7 +301,7 @@ def _hinge_mats(chain: Chain, qpos: jax.Array) -> jax.Array:
     angle = (qpos - chain.reference)[:NUM_JOINTS]
     along = chain.axis[:, None] * chain.axis
     columns = jnp.eye(3, dtype=along.dtype).reshape(3, 3, *[1] * angle.ndim)
-    return along + jnp.cos(angle) * (columns - along) + jnp.sin(angle) * _cross(chain.axis[:, None], columns)
+    return along + jnp.cos(angle) * (columns - along) + jnp.sin(angle) * cross(chain.axis[:, None], columns)
 
 
 def _compose(mat: jax.Array, *, reach: int) -> jax.Array:
@@ -316,8 +317,8 @@ def _hinge_quats(chain: Chain, qpos: jax.Array) -> jax.Array:
 
 def _quat_product(a: jax.Array, b: jax.Array) -> jax.Array:
     """Hamilton product of quaternions [4, ...]."""
-    scalar = a[0] * b[0] - _sum_rows(a[1:] * b[1:])
-    return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + _cross(a[1:], b[1:])])
+    scalar = a[0] * b[0] - sum_rows(a[1:] * b[1:])
+    return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:])])
 
 
 def _rotate(mat: jax.Array, v: jax.Array) -> jax.Array:
@@ -350,9 +351,9 @@ def _site(chain: Chain, frames: _Frames) -> tuple[jax.Array, jax.Array, jax.Arra
     A hinge's screw, [6, 7, ...], is the twist that it gives to the links behind it when it turns at 1 rad/s.
     """
     axis = _rotate(frames.mat, chain.axis)
-    jacobian = jnp.concatenate([_cross(axis, frames.eef[:, None] - frames.pos), axis])
+    jacobian = jnp.concatenate([cross(axis, frames.eef[:, None] - frames.pos), axis])
     mat = _product(frames.mat[:, :, -1], chain.site_axes)
-    return chain.base + frames.eef, mat, jacobian, jnp.concatenate([axis, _cross(frames.pos, axis)])
+    return chain.base + frames.eef, mat, jacobian, jnp.concatenate([axis, cross(frames.pos, axis)])
 
 
 def _inertias(chain: Chain, frames: _Frames, qpos: jax.Array) -> _Inertias:
@@ -382,8 +383,8 @@ def _point_moments(first: jax.Array, com: jax.Array) -> jax.Array:
 def _momentum(inertias: _Inertias, twist: jax.Array) -> jax.Array:
     """Spatial inertias times twists, [6, k, ...]."""
     turn, move = twist[:3], twist[3:]
-    moment = _rotate(inertias.second, turn) + _cross(inertias.first, move)
-    return jnp.concatenate([moment, inertias.mass * move - _cross(inertias.first, turn)])
+    moment = _rotate(inertias.second, turn) + cross(inertias.first, move)
+    return jnp.concatenate([moment, inertias.mass * move - cross(inertias.first, turn)])
 
 
 def _mass_matrix(chain: Chain, screws: jax.Array, inertias: _Inertias) -> jax.Array:
@@ -391,7 +392,7 @@ def _mass_matrix(chain: Chain, screws: jax.Array, inertias: _Inertias) -> jax.Ar
     mass, first = _backward_sum(inertias.mass[None])[0], _backward_sum(inertias.first)
     second = jnp.stack([_backward_sum(row) for row in inertias.second])
     momentum = _momentum(_Inertias(mass, first, second), screws)
-    product = _sum_rows(screws[:, :, None] * momentum[:, None])
+    product = sum_rows(screws[:, :, None] * momentum[:, None])
     row, column = np.indices((NUM_JOINTS, NUM_JOINTS)).reshape(2, NUM_JOINTS, NUM_JOINTS, *[1] * (product.ndim - 2))
     # Of two joints, the outer one's composite inertia counts.
     symmetric = jnp.where(row <= column, product, jnp.swapaxes(product, 0, 1))
@@ -421,15 +422,15 @@ def _forces(chain: Chain, inertias: _Inertias, twist: jax.Array, added: jax.Arra
     """Forces on the nine bodies while no joint accelerates, [6, 9, ...] (recursive Newton-Euler algorithm)."""
     turn, move = twist[:3], twist[3:]
     # A joint's twist is carried along by its body, so it changes direction.
-    change = jnp.concatenate([_cross(turn, added[:3]), _cross(turn, added[3:]) + _cross(move, added[:3])])
+    change = jnp.concatenate([cross(turn, added[:3]), cross(turn, added[3:]) + cross(move, added[:3])])
     accelerations = _accumulate(change)
     # Gravity is an upward acceleration of the base.
     lifted = jnp.concatenate([accelerations[:3], accelerations[3:] - chain.gravity[:, None]])
     momentum = _momentum(inertias, twist)
-    gyroscopic = jnp.concatenate([_cross(turn, momentum[:3]) + _cross(move, momentum[3:]), _cross(turn, momentum[3:])])
+    gyroscopic = jnp.concatenate([cross(turn, momentum[:3]) + cross(move, momentum[3:]), cross(turn, momentum[3:])])
     return _momentum(inertias, lifted) + gyroscopic
 
 
 def _project(screws: jax.Array, force: jax.Array) -> jax.Array:
     """Torques of the hinges, [7, ...]: each carries the forces on everything behind it."""
-    return _sum_rows(screws * _backward_sum(force))
+    return sum_rows(screws * _backward_sum(force))

@@ -2,8 +2,8 @@
 
 In: the arm's kinematics and dynamics (``ArmState``), and once per control tick a 6-D action, which sets the goal pose.
 Out: joint torques for each physics substep. ``set_goal`` and ``torques`` take arrays with any leading batch axes and
-work under ``jit``, ``vmap`` and ``grad``; the dtype follows the inputs. ``compile_substeps`` gives the jitted functions
-that a simulator on the CPU calls once per physics substep, with one packed row per slot.
+work under ``jit``, ``vmap`` and ``grad``; the dtype follows the inputs. Nothing is remembered between calls: the goal
+is the caller's to keep. ``osc_numba`` is the same controller with its memory, for a simulator that is not JAX's.
 
 How torques are computed: robosuite inverts ``J M⁻¹ Jᵀ``, which squares the conditioning of the arm. Here M = L Lᵀ is
 factored and the columns of X = L⁻¹ Jᵀ are made orthogonal (modified Gram-Schmidt). The torques are the same:
@@ -13,25 +13,21 @@ factored and the columns of X = L⁻¹ Jᵀ are made orthogonal (modified Gram-S
 
 A column that vanishes (an exactly singular arm) is dropped; robosuite's pseudo-inverse drops a singular value instead.
 Nothing calls LAPACK: matrices are held batch-last and every operation is elementwise over the slots, so no slot affects
-another, and ``compile_substeps`` gives a slot the same bits in any batch.
+another.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jax.experimental.xla_metadata import set_xla_metadata
 
-from vecenv.controllers import gripper as gripper_control
-from vecenv.controllers.gripper import PANDA_GRIPPER, GripperConfig
+from vecenv.controllers._batch_last import cross, fenced_on_cpu, stage, sum_rows
 from vecenv.controllers.rotations import matmul, require_tail, safe_norm
 
 NUM_JOINTS = 7
@@ -136,16 +132,11 @@ def set_goal(arm: ArmState, goal: OscGoal, delta_action: jax.Array, config: OscC
     """
     arm, goal, action = _check_arm(arm), _check_goal(goal), jnp.asarray(delta_action)
     require_tail("delta_action", action, (6,))
-    return _next_goal(OscGoal(arm.eef_pos, arm.eef_mat), goal, action, config)
-
-
-def _next_goal(eef: OscGoal, goal: OscGoal, action: jax.Array, config: OscConfig) -> OscGoal:
-    """``set_goal`` from the pose of the end effector."""
     action = jnp.clip(action, -1, 1)
     rotvec = action[..., 3:] * config.max_delta_ori
-    turned = matmul(_robosuite_rotation(rotvec), eef.mat)
+    turned = matmul(_robosuite_rotation(rotvec), arm.eef_mat)
     keep = (rotvec == 0).all(-1)[..., None, None]
-    return OscGoal(eef.pos + action[..., :3] * config.max_delta_pos, jnp.where(keep, goal.mat, turned))
+    return OscGoal(arm.eef_pos + action[..., :3] * config.max_delta_pos, jnp.where(keep, goal.mat, turned))
 
 
 def _robosuite_rotation(rotvec: jax.Array) -> jax.Array:
@@ -206,80 +197,43 @@ def torques(arm: ArmState, goal: OscGoal, home_qpos: jax.Array, config: OscConfi
     tails = (*_TAILS, (3,), (3, 3), (7,))
     inputs = (*arm, *goal, home)
     batch = jnp.broadcast_shapes(*(x.shape[: x.ndim - len(tail)] for x, tail in zip(inputs, tails, strict=True)))
-    last = [_batch_last(x, batch, tail) for x, tail in zip(inputs, tails, strict=True)]
-    result = _fenced_on_cpu(_torques_last, ArmState(*last[:7]), OscGoal(*last[7:9]), last[9], config=config)
+    last = [_to_batch_last(x, batch, tail) for x, tail in zip(inputs, tails, strict=True)]
+    result = fenced_on_cpu(_torques_last, ArmState(*last[:7]), OscGoal(*last[7:9]), last[9], config=config)
     return jnp.moveaxis(result, -1, 0).reshape(*batch, NUM_JOINTS)
 
 
-def _batch_last(x: jax.Array, batch: tuple[int, ...], tail: tuple[int, ...]) -> jax.Array:
+def _to_batch_last(x: jax.Array, batch: tuple[int, ...], tail: tuple[int, ...]) -> jax.Array:
     """[..., *tail] -> [*tail, N] with all batch axes flattened into the last."""
     return jnp.moveaxis(jnp.broadcast_to(x, batch + tail).reshape(-1, *tail), 0, -1)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Batch-last arithmetic: arrays are [rows, columns, slots] from here on. The work is cut into stages, see ``_stage``.
-
-
-def _fenced_on_cpu(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
-    """Call ``function(*args, fence=..., **options)``, fenced if the program is compiled for a CPU."""
-    fenced, plain = (partial(function, fence=fence, **options) for fence in (True, False))
-    return lax.platform_dependent(*args, cpu=fenced, default=plain)
-
-
-def _stage(fence: bool, function: Callable[..., Any], *args: Any) -> Any:
-    """Apply a stage; with ``fence``, as a call that XLA compiles on its own.
-
-    XLA's CPU fusion copies a cheap producer into each of its consumers, and along a chain of eliminations that repeats
-    the first steps thousands of times. ``optimization_barrier`` is gone before fusion runs; a call that may not be
-    inlined stays. 512 slots take 0.5 ms instead of 2, and compiling 1 s instead of 5.
-    """
-    if not fence:
-        return function(*args)
-
-    def without_mark(*args: Any) -> Any:
-        with set_xla_metadata(inlineable=None):
-            return function(*args)
-
-    with set_xla_metadata(inlineable="false"):
-        return jax.jit(without_mark)(*args)
-
-
-def _sum_rows(x: jax.Array) -> jax.Array:
-    """Sum over axis 0 in a fixed order, elementwise over the rest."""
-    total = x[0]
-    for i in range(1, x.shape[0]):
-        total = total + x[i]
-    return total
-
-
-def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Cross product of [3, ...] with [3, ...]."""
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+# Arrays are [rows, columns, slots] from here on, and the work is cut into stages: see ``_batch_last``.
 
 
 def _torques_last(arm: ArmState, goal: OscGoal, home: jax.Array, *, config: OscConfig, fence: bool) -> jax.Array:
     """``torques`` on batch-last arrays: [7, N]."""
-    force, moment, acceleration = _stage(fence, partial(_desired, config=config), arm, goal, home)
-    tables = [_stage(fence, _table, arm.mass_matrix, arm.jacobian, acceleration)]
+    force, moment, acceleration = stage(fence, partial(_desired, config=config), arm, goal, home)
+    tables = [stage(fence, _table, arm.mass_matrix, arm.jacobian, acceleration)]
     for _ in range(NUM_JOINTS - 1):
-        tables.append(_stage(fence, _eliminate_row, tables[-1]))
-    factor, whitened = _stage(fence, _scale_rows, tables)
-    both, turning, floor, turning_floor = _stage(fence, _systems, whitened, force, moment)
+        tables.append(stage(fence, _eliminate_row, tables[-1]))
+    factor, whitened = stage(fence, _scale_rows, tables)
+    both, turning, floor, turning_floor = stage(fence, _systems, whitened, force, moment)
     basis, rest = _orthogonalise(both, floor, 6, fence)
     turning_basis, _ = _orthogonalise(turning, turning_floor, 3, fence)
     # Rounding leaves up to a condition number of the projection behind: project a second time.
-    left = _stage(fence, _components, basis, rest)
-    free = _stage(fence, _remove_all, basis, left, rest)
-    linear, angular = _stage(fence, _solutions, basis[:3], turning_basis)
-    total = _stage(fence, _add_solutions, basis[:3] + turning_basis, linear + angular, free)
-    return _stage(fence, partial(_finish, config=config), factor, total, arm.bias)
+    left = stage(fence, _components, basis, rest)
+    free = stage(fence, _remove_all, basis, left, rest)
+    linear, angular = stage(fence, _solutions, basis[:3], turning_basis)
+    total = stage(fence, _add_solutions, basis[:3] + turning_basis, linear + angular, free)
+    return stage(fence, partial(_finish, config=config), factor, total, arm.bias)
 
 
 def _desired(arm: ArmState, goal: OscGoal, home: jax.Array, *, config: OscConfig) -> tuple[jax.Array, ...]:
     """Desired linear [3, N], angular [3, N] and joint [7, N] accelerations: springs and dampers."""
     kd = 2 * math.sqrt(config.kp) * config.damping_ratio
-    velocity = _sum_rows(jnp.moveaxis(arm.jacobian * arm.qvel, 1, 0))
-    turn = sum(_cross(arm.eef_mat[:, i], goal.mat[:, i]) for i in range(3))
+    velocity = sum_rows(jnp.moveaxis(arm.jacobian * arm.qvel, 1, 0))
+    turn = sum(cross(arm.eef_mat[:, i], goal.mat[:, i]) for i in range(3))
     force = config.kp * (goal.pos - arm.eef_pos) - kd * velocity[:3]
     moment = 0.5 * config.kp * turn - kd * velocity[3:]
     joint_kd = 2 * math.sqrt(config.nullspace_kp)
@@ -288,7 +242,7 @@ def _desired(arm: ArmState, goal: OscGoal, home: jax.Array, *, config: OscConfig
 
 def _table(mass_matrix: jax.Array, jacobian: jax.Array, acceleration: jax.Array) -> jax.Array:
     """[M | Jᵀ | M a], [7, 14, N]: eliminating M's lower triangle leaves the rows of D Lᵀ, D X and D Lᵀ a."""
-    inertial = _sum_rows(mass_matrix * acceleration[:, None])
+    inertial = sum_rows(mass_matrix * acceleration[:, None])
     return jnp.concatenate([mass_matrix, jnp.moveaxis(jacobian, 0, 1), inertial[:, None]], axis=1)
 
 
@@ -317,7 +271,7 @@ def _systems(whitened: jax.Array, force: jax.Array, moment: jax.Array) -> tuple[
     columns = whitened[:, :6]
     sides = jnp.concatenate([force, jnp.zeros_like(whitened[0, 3:])])
     epsilon = float(jnp.finfo(whitened.dtype).eps)
-    floor = max(_RANK_TOLERANCE, (16 * epsilon) ** 2) * _sum_rows(columns * columns)
+    floor = max(_RANK_TOLERANCE, (16 * epsilon) ** 2) * sum_rows(columns * columns)
     turning = jnp.concatenate([columns[:, 3:], moment[None]])
     return jnp.concatenate([whitened, sides[None]]), turning, floor, floor[3:]
 
@@ -337,19 +291,19 @@ def _orthogonalise(block: jax.Array, floor: jax.Array, count: int, fence: bool) 
     """
     basis = []
     for k in range(count):
-        inverse, ratio = _stage(fence, partial(_project, index=k), block, floor)
+        inverse, ratio = stage(fence, partial(_project, index=k), block, floor)
         basis.append(_Direction(block, inverse))
-        block = _stage(fence, _remove, block, ratio)
+        block = stage(fence, _remove, block, ratio)
     return basis, block
 
 
 def _project(block: jax.Array, floor: jax.Array, *, index: int) -> tuple[jax.Array, jax.Array]:
     """Inverse squared length of the first column [N] and the other columns' components along it [k - 1, N]."""
     pivot = block[:7, 0]
-    squared = _sum_rows(pivot * pivot)
+    squared = sum_rows(pivot * pivot)
     kept = squared > floor[index]
     inverse = jnp.where(kept, 1 / jnp.where(kept, squared, 1), 0)
-    return inverse, _sum_rows(pivot[:, None] * block[:7, 1:]) * inverse
+    return inverse, sum_rows(pivot[:, None] * block[:7, 1:]) * inverse
 
 
 def _remove(block: jax.Array, ratio: jax.Array) -> jax.Array:
@@ -359,7 +313,7 @@ def _remove(block: jax.Array, ratio: jax.Array) -> jax.Array:
 
 def _components(basis: list[_Direction], rest: jax.Array) -> list[jax.Array]:
     """Components [N] of the last column [8, 1, N] along each direction."""
-    return [_sum_rows(along.block[:7, 0] * rest[:7, 0]) * along.inverse for along in basis]
+    return [sum_rows(along.block[:7, 0] * rest[:7, 0]) * along.inverse for along in basis]
 
 
 def _remove_all(basis: list[_Direction], components: list[jax.Array], rest: jax.Array) -> jax.Array:
@@ -384,7 +338,7 @@ def _solutions(*bases: list[_Direction]) -> list[list[jax.Array]]:
         for k in range(len(basis) - 2, -1, -1):
             left = vectors[k][7]
             for vector, component in zip(vectors[k + 1 :], components, strict=True):
-                left = left - _sum_rows(vectors[k][:7] * vector[:7]) * component
+                left = left - sum_rows(vectors[k][:7] * vector[:7]) * component
             components.insert(0, left * basis[k].inverse)
         found.append(components)
     return found
@@ -399,278 +353,6 @@ def _add_solutions(basis: list[_Direction], components: list[jax.Array], free: j
 
 def _finish(factor: jax.Array, whitened: jax.Array, bias: jax.Array, *, config: OscConfig) -> jax.Array:
     """Torques ``L whitened + bias``, clipped, [7, N]."""
-    raw = _sum_rows(factor * whitened[:, None]) + bias
+    raw = sum_rows(factor * whitened[:, None]) + bias
     limit = jnp.asarray(config.torque_limit, raw.dtype)[:, None]
     return jnp.clip(raw, -limit, limit)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The native backend's entry: one packed row per slot, one jitted call per physics substep.
-
-# Widths of a packed row's fields, in order. The mass matrix is its lower triangle, row by row.
-PACKED_FIELDS = {
-    "qpos": 7,
-    "qvel": 7,
-    "eef_pos": 3,
-    "eef_mat": 9,
-    "xanchor": 21,
-    "xaxis": 21,
-    "mass_lower": 28,
-    "bias": 7,
-}
-PACKED_SIZE = sum(PACKED_FIELDS.values())
-
-
-def packed_slices() -> dict[str, slice]:
-    """Columns of each field in a packed row, by name."""
-    ends = np.cumsum(list(PACKED_FIELDS.values()))
-    return {
-        name: slice(int(end) - width, int(end)) for (name, width), end in zip(PACKED_FIELDS.items(), ends, strict=True)
-    }
-
-
-@jax.jit
-def arm_from_packed(packed: jax.Array) -> ArmState:
-    """Read an arm from packed rows.
-
-    Args:
-        packed: [..., 103]: joint angles 7, joint velocities 7, grip site position 3 and orientation 9 (row-major),
-            joint anchors 7x3, joint axes 7x3 (all world frame), lower triangle of the mass matrix 28 (row i has
-            i + 1 entries), bias torques 7. All joints are hinges.
-
-    Returns:
-        The arm. Column j of the Jacobian is ``axis_j x (eef - anchor_j)`` over ``axis_j``.
-
-    Raises:
-        ValueError: the last axis is not 103 wide.
-    """
-    packed = jnp.asarray(packed)
-    require_tail("packed", packed, (PACKED_SIZE,))
-    arm = _unpack_last(_batch_last(packed, packed.shape[:-1], (PACKED_SIZE,)), fence=False)
-    return ArmState(*(jnp.moveaxis(x, -1, 0).reshape(*packed.shape[:-1], *x.shape[:-1]) for x in arm))
-
-
-def _unpack_last(rows: jax.Array, *, fence: bool) -> ArmState:
-    """Batch-last arm of packed rows [103, N]."""
-    field = {name: rows[columns] for name, columns in packed_slices().items()}
-    geometry = (field["eef_pos"], field["xanchor"], field["xaxis"], field["mass_lower"])
-    jacobian, mass_matrix = _stage(fence, _assemble, *geometry)
-    mat = field["eef_mat"].reshape(3, 3, -1)
-    return ArmState(field["qpos"], field["qvel"], field["eef_pos"], mat, jacobian, mass_matrix, field["bias"])
-
-
-def _assemble(eef: jax.Array, anchor: jax.Array, axis: jax.Array, lower: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Jacobian [6, 7, N] and mass matrix [7, 7, N]."""
-    axis = jnp.moveaxis(axis.reshape(NUM_JOINTS, 3, -1), 1, 0)
-    arm = eef[:, None] - jnp.moveaxis(anchor.reshape(NUM_JOINTS, 3, -1), 1, 0)
-    row, column = np.indices((NUM_JOINTS, NUM_JOINTS))
-    high, low = np.maximum(row, column), np.minimum(row, column)
-    return jnp.concatenate([_cross(axis, arm), axis]), lower[high * (high + 1) // 2 + low]
-
-
-class ControlState(NamedTuple):
-    """What the controllers of a batch remember between physics substeps.
-
-    Attributes:
-        goal: the OSC goal of each slot.
-        gripper: integrated finger targets, [B, 2].
-        grip: gripper action of the present tick, [B].
-        home: packed arm at reset, [B, 103]; its joint angles are the posture the arm is drawn to.
-    """
-
-    goal: OscGoal
-    gripper: jax.Array
-    grip: jax.Array
-    home: jax.Array
-
-
-def initial_control_state(home_packed: Any) -> ControlState:
-    """Controllers as they are after a reset: goal at the home pose, gripper target in the middle.
-
-    Args:
-        home_packed: packed arm at reset, [B, 103]: joints at robosuite's ``init_qpos``, at rest, fingers at 0 (the
-            controller is loaded before the fingers are placed).
-
-    Returns:
-        The state of B controllers, on the device of ``home_packed``.
-
-    Raises:
-        ValueError: ``home_packed`` is not [B, 103].
-    """
-    home = jnp.asarray(home_packed)
-    _require_rows("home_packed", home, PACKED_SIZE, home.shape[0] if home.ndim else 0)
-    pose = _packed_pose(home)
-    return ControlState(pose, jnp.zeros_like(home[:, :2]), jnp.zeros_like(home[:, 0]), home)
-
-
-def rearm(state: ControlState, mask: Any) -> ControlState:
-    """Put the slots in ``mask``, bool [B], back to ``initial_control_state``; the others keep theirs."""
-    fresh = initial_control_state(state.home)
-    chosen = jnp.asarray(mask)
-    return jax.tree.map(lambda new, old: jnp.where(_align(chosen, old), new, old), fresh, state)
-
-
-def _align(mask: jax.Array, array: jax.Array) -> jax.Array:
-    return mask.reshape(mask.shape + (1,) * (array.ndim - mask.ndim))
-
-
-def _packed_pose(packed: jax.Array) -> OscGoal:
-    columns = packed_slices()
-    return OscGoal(packed[:, columns["eef_pos"]], packed[:, columns["eef_mat"]].reshape(-1, 3, 3))
-
-
-def _require_rows(name: str, array: jax.Array, width: int, rows: int) -> None:
-    if array.shape != (rows, width):
-        raise ValueError(f"{name} must have shape [{rows}, {width}], got {list(array.shape)}")
-
-
-def begin_tick(
-    state: ControlState,
-    packed: jax.Array,
-    action: jax.Array,
-    stale: jax.Array,
-    config: OscConfig = OSC_POSE,
-    gripper: GripperConfig = PANDA_GRIPPER,
-) -> tuple[jax.Array, ControlState]:
-    """First physics substep of a control tick: take the action as the new goal, then compute the controls.
-
-    Args:
-        state: the controllers.
-        packed: packed arms, [B, 103].
-        action: policy actions, [B, 7]: position, rotation vector, gripper (+1 closes).
-        stale: bool [B], the slots whose controller still sees the arm of the reset. After ``reset(); set_init_state()``
-            robosuite's controller believes it is up to date, so in the first substep of an episode it computes the
-            goal and the torques from the home arm; only the bias torques are read from the simulator.
-        config: the arm controller.
-        gripper: the gripper.
-
-    Returns:
-        Actuator commands [B, 9] (seven torques, two finger targets) and the controllers after this substep.
-
-    Raises:
-        ValueError: a shape does not match.
-    """
-    rows = state.home.shape[0]
-    packed, action = jnp.asarray(packed), jnp.asarray(action, state.home.dtype)
-    _require_rows("packed", packed, PACKED_SIZE, rows)
-    _require_rows("action", action, 7, rows)
-    current = jnp.arange(PACKED_SIZE) >= packed_slices()["bias"].start
-    packed = jnp.where(jnp.asarray(stale)[:, None] & ~current, state.home, packed)
-    goal = _next_goal(_packed_pose(packed), state.goal, action[:, :6], config)
-    return continue_tick(state._replace(goal=goal, grip=action[:, 6]), packed, config, gripper)
-
-
-def continue_tick(
-    state: ControlState,
-    packed: jax.Array,
-    config: OscConfig = OSC_POSE,
-    gripper: GripperConfig = PANDA_GRIPPER,
-) -> tuple[jax.Array, ControlState]:
-    """Any later physics substep of a control tick: compute the controls for the goal already set.
-
-    Args, returns and raises as in ``begin_tick``.
-    """
-    packed = jnp.asarray(packed)
-    _require_rows("packed", packed, PACKED_SIZE, state.home.shape[0])
-    torque = _fenced_on_cpu(_packed_torques, packed, state.goal, state.home[:, :NUM_JOINTS], config=config)
-    fingers = gripper_control.integrate(state.gripper, state.grip, gripper)
-    ctrl = jnp.concatenate([torque, gripper_control.command(fingers, gripper)], axis=-1)
-    return ctrl, state._replace(gripper=fingers)
-
-
-def _packed_torques(packed: jax.Array, goal: OscGoal, home: jax.Array, *, config: OscConfig, fence: bool) -> jax.Array:
-    """Torques [B, 7] from packed arms [B, 103]."""
-    arm = _unpack_last(_stage(fence, jnp.transpose, packed), fence=fence)
-    goal_last = OscGoal(*(jnp.moveaxis(x, 0, -1) for x in goal))
-    return _torques_last(arm, goal_last, home.T, config=config, fence=fence).T
-
-
-class Substeps(NamedTuple):
-    """Compiled controllers of a batch: NumPy in, NumPy controls out, their memory kept in a ``ControlState``.
-
-    Attributes:
-        start: ``start(home_packed [B, 103]) -> ControlState``.
-        begin: ``begin(state, packed [B, 103], action [B, 7], stale [B]) -> (ctrl [B, 9], state)``; see ``begin_tick``.
-        proceed: ``proceed(state, packed [B, 103]) -> (ctrl [B, 9], state)``; see ``continue_tick``.
-        rearm: ``rearm(state, mask [B]) -> state``.
-    """
-
-    start: Callable[[Any], ControlState]
-    begin: Callable[[ControlState, Any, Any, Any], tuple[np.ndarray, ControlState]]
-    proceed: Callable[[ControlState, Any], tuple[np.ndarray, ControlState]]
-    rearm: Callable[[ControlState, Any], ControlState]
-
-
-# Fusion emitters repeat shared work; the concurrency-optimised schedule wakes threads for microseconds of work.
-_CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_enable_concurrency_optimized_scheduler": False}
-
-
-def _in_whole_vectors(function: Callable[..., Any], state: ControlState, packed: Any, *inputs: Any) -> Any:
-    """Run on a batch padded to a multiple of 8 slots, so that no slot falls into a loop's remainder.
-
-    The remainder is compiled apart and may fuse other multiplications with additions: without this, a slot's torques
-    differ in the last bit between batch sizes (seen at 5 slots).
-    """
-    count = state.home.shape[0]
-    for name, array, width in zip(("packed", "action"), (packed, *inputs), (PACKED_SIZE, 7), strict=False):
-        _require_rows(name, array, width, count)
-    missing = -count % 8
-    args = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], missing, 0)]), (state, packed, *inputs))
-    return jax.tree.map(lambda x: x[:count], function(*args))
-
-
-@partial(jax.jit, static_argnames=("config", "gripper"), compiler_options=_CPU_OPTIONS)
-def _begin_on_cpu(
-    state: ControlState, packed: Any, action: Any, stale: Any, *, config: OscConfig, gripper: GripperConfig
-) -> tuple[jax.Array, ControlState]:
-    begin = partial(begin_tick, config=config, gripper=gripper)
-    return _in_whole_vectors(begin, state, packed, action, stale)
-
-
-@partial(jax.jit, static_argnames=("config", "gripper"), compiler_options=_CPU_OPTIONS)
-def _proceed_on_cpu(
-    state: ControlState, packed: Any, *, config: OscConfig, gripper: GripperConfig
-) -> tuple[jax.Array, jax.Array]:
-    proceed = partial(continue_tick, config=config, gripper=gripper)
-    ctrl, following = _in_whole_vectors(proceed, state, packed)
-    return ctrl, following.gripper
-
-
-_rearm_on_cpu = jax.jit(rearm)
-
-
-def compile_substeps(config: OscConfig = OSC_POSE, gripper: GripperConfig = PANDA_GRIPPER) -> Substeps:
-    """Controllers for a simulator that runs on the CPU in float64, one jitted call per physics substep.
-
-    Each batch size compiles once, in about a second for each function. float64 is switched on for these calls only, and
-    they run on the CPU whatever JAX's default device is. Keep ``packed`` float64: another dtype compiles again.
-
-    Args:
-        config: the arm controller.
-        gripper: the gripper.
-
-    Returns:
-        The functions to call.
-    """
-    cpu = jax.devices("cpu")[0]
-    configs = {"config": config, "gripper": gripper}
-
-    def run_start(home_packed: Any) -> ControlState:
-        with jax.enable_x64(True), jax.default_device(cpu):
-            return jax.device_put(initial_control_state(np.asarray(home_packed, np.float64)), cpu)
-
-    def run_begin(state: ControlState, packed: Any, action: Any, stale: Any) -> tuple[np.ndarray, ControlState]:
-        with jax.enable_x64(True):
-            ctrl, following = _begin_on_cpu(state, packed, action, stale, **configs)
-        return np.asarray(ctrl), following
-
-    def run_proceed(state: ControlState, packed: Any) -> tuple[np.ndarray, ControlState]:
-        with jax.enable_x64(True):
-            ctrl, fingers = _proceed_on_cpu(state, packed, **configs)
-        return np.asarray(ctrl), state._replace(gripper=fingers)
-
-    def run_rearm(state: ControlState, mask: Any) -> ControlState:
-        with jax.enable_x64(True):
-            return _rearm_on_cpu(state, mask)
-
-    return Substeps(run_start, run_begin, run_proceed, run_rearm)

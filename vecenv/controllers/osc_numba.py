@@ -314,7 +314,7 @@ def _clip(x, low, high):
 
 @_part
 def _next_goal(slot, arm, action, settings):
-    """``osc._next_goal``: the goal from the arm's pose and the clipped action."""
+    """``osc.set_goal``: the goal from the arm's pose and the clipped action."""
     x = _clip(action[3], -1.0, 1.0) * settings.max_delta_ori
     y = _clip(action[4], -1.0, 1.0) * settings.max_delta_ori
     z = _clip(action[5], -1.0, 1.0) * settings.max_delta_ori

@@ -37,6 +37,7 @@ from vecenv.libero import fixtures as fixture_poses
 from vecenv.libero import goals
 from vecenv.libero import settled as settled_starts
 from vecenv.libero.bddl import Problem
+from vecenv.libero.export import exported_tasks
 from vecenv.libero.geometry import PROFILES
 from vecenv.libero.objectives import OBJECTIVES, Objective, View
 from vecenv.libero.scene import Scene
@@ -74,6 +75,7 @@ class FunctionalConfig:
     Attributes:
         impl: ``"warp"``, ``"jax"``, or None: warp where JAX runs on CUDA and jax elsewhere.
         geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, at most 24 fitted ones.
+        scenes: a folder that ``vecenv compile`` wrote, in place of the installed packages.
         budget: contact and constraint memory of a world; None measures the scene once and remembers it.
         iterations: solver iterations and line-search steps a substep at most; None for those of ``vecenv.make``.
         cone: friction cones: ``"elliptic"`` as upstream; or ``"pyramidal"``, with which derivatives of ``impl="jax"``
@@ -97,6 +99,7 @@ class FunctionalConfig:
 
     impl: str | None = None
     geometry: str = "exact"
+    scenes: str | None = None
     budget: Budget | None = None
     iterations: tuple[int, int] | None = None
     cone: str = "elliptic"
@@ -168,6 +171,7 @@ class Data:
         qpos: [nq]. qvel: [nv]. time: seconds. ctrl: last actuator commands, [nu].
         qacc_warmstart: where the solver starts, [nv].
         xpos: body positions, world frame, metres, [nbody, 3]. xquat: body orientations, wxyz, [nbody, 4].
+        geom_xpos: [ngeom, 3]. geom_xmat: [ngeom, 3, 3]; warp computes those of fixtures only when an episode begins.
         site_xpos: [nsite, 3]. site_xmat: [nsite, 3, 3]. sensordata: contact sensors, [nsensordata].
         world: fixture poses, controller memory, proprioception and faults (``vecenv.physics.mjx.World``, no ``data``).
         start_height: height of the target's origin when the episode began, metres.
@@ -180,6 +184,8 @@ class Data:
     qacc_warmstart: jax.Array
     xpos: jax.Array
     xquat: jax.Array
+    geom_xpos: jax.Array
+    geom_xmat: jax.Array
     site_xpos: jax.Array
     site_xmat: jax.Array
     sensordata: jax.Array
@@ -477,7 +483,8 @@ class LiberoEnv:
     ) -> None:
         self.config = _overridden(config or default_config(), config_overrides or {})
         self.suite, self.task = suite, task
-        sources = installed_tasks(suite)
+        folder = self.config.scenes
+        sources = installed_tasks(suite) if folder is None else exported_tasks(folder, suite)
         if not 0 <= task < len(sources):
             raise UnknownTask(f"{suite} has tasks 0 to {len(sources) - 1}, not {task}")
         source, problem = sources[task], sources[task].problem()
@@ -485,7 +492,9 @@ class LiberoEnv:
         sharing = _sharing(sources, problem)
         self.scene = _with_cone(_scene(source, sharing, self.config.geometry), CONES[self.config.cone])
         budget = self.config.budget or _measured(self.scene, sharing)
-        built = mjx_physics.build(self.scene, impl=self.config.impl, budget=budget, iterations=self.config.iterations)
+        usual = mjx_physics.LEAN_ITERATIONS if self.config.geometry == "lean" else mjx_physics.ITERATIONS
+        iterations = self.config.iterations or usual
+        built = mjx_physics.build(self.scene, impl=self.config.impl, budget=budget, iterations=iterations)
         self.impl, self.budget = built.impl, budget
         self._physics = _Physics(built, self.config.action)
         # Playground's wrapper for domain randomisation puts another model here while it traces.

@@ -1,9 +1,9 @@
 """Few boxes and capsules in the place of many: fits of simple shapes to the convex solids an object is made of.
 
-In: the solids of one body (boxes, capsules, cylinders, hulls of meshes), in that body's frame. Out: a short list of boxes
-or capsules that stands for them. Every fit is a deterministic formula of the solids: bounding boxes with the area of what
-they replace, greedy merging, vessels (a floor and a ring of walls), round columns, capsules. Lengths are metres. Which fit
-suits which object is data, see ``vecenv.libero.geometry``.
+In: the solids of one body (boxes, capsules, cylinders, hulls of meshes), in that body's frame. Out: a short list of
+boxes or capsules that stands for them. Every fit is a deterministic formula of the solids: bounding boxes with the area
+of what they replace, greedy merging, vessels (a floor and a ring of walls), round columns, capsules. Lengths are in
+metres. Which fit suits which object is data, see ``vecenv.libero.recipes``.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Solid:
     """A convex solid in its body's frame.
 
     Attributes:
-        kind: ``BOX`` (half extents), ``CAPSULE`` and ``CYLINDER`` (radius, half length, 0; along the local z) or ``HULL``
-            (half extents of its box).
+        kind: ``BOX`` (half extents), ``CAPSULE`` and ``CYLINDER`` (radius, half length, 0; along the local z) or
+            ``HULL`` (half extents of its box).
         pos: centre, metres, [3].
         mat: rotation, [3, 3].
         size: see ``kind``, metres, [3].
@@ -140,10 +140,8 @@ def surface_points(solids: Sequence[Solid], spacing: float = 0.002) -> np.ndarra
 
 
 def _own_surface(solid: Solid, spacing: float) -> np.ndarray:
-    if solid.kind in (BOX, HULL):
-        local = _box_surface(solid.size, spacing)
-    else:
-        local = _round_surface(solid, spacing)
+    flat = solid.kind in (BOX, HULL)
+    local = _box_surface(solid.size, spacing) if flat else _round_surface(solid, spacing)
     return solid.pos + local @ solid.mat.T
 
 
@@ -336,7 +334,7 @@ def column(solids: Sequence[Solid], up: int, blades: int = 2) -> list[Solid]:
 
 
 def _polygon_scale(sides: int) -> float:
-    """Apothem of the regular polygon whose outline lies at distance 1 from its centre on average over all directions."""
+    """Apothem of the regular polygon whose outline lies at distance 1 from its centre, averaged over all directions."""
     angle = np.pi / sides
     return angle / np.log(np.tan(angle / 2 + np.pi / 4))
 
@@ -525,7 +523,7 @@ def _ring(found: Vessel, walls: int) -> list[Solid]:
 
 
 def _meridian(solid: Solid, centre: np.ndarray) -> tuple[float, float, float, float, float]:
-    """Of a wall: radius and height of its middle, angle from vertical (positive outwards), half height, half thickness."""
+    """Of a wall: radius and height of its middle, angle from vertical (outwards), half height, half thickness."""
     half = solid.half_extents
     thin = int(np.argmin(half))
     outward = np.array([*(solid.pos[:2] - centre), 0.0])
@@ -549,7 +547,7 @@ def long_capsule(solids: Sequence[Solid]) -> Solid:
     return capsule(around.pos - axis, around.pos + axis, radius)
 
 
-# The end of a solid is this share of its length, and it is an edge rather than a tip when it is that much longer than wide.
+# The end of a solid is this share of its length; it is an edge, not a tip, when it is that much longer than wide.
 _END = 0.25
 _EDGE = 1.5
 
@@ -581,3 +579,11 @@ def end_capsule(solids: Sequence[Solid], end: np.ndarray, inner: np.ndarray | No
         start += inner * ((other @ inner).max() - radius - start @ inner)
         middle = middle + inner * ((tip @ inner).max() - radius - middle @ inner)
     return capsule(start, middle, radius)
+
+
+# -- how far apart two shapes are --------------------------------------------------------------------------------------
+
+
+def gaps(solids: Sequence[Solid], others: Sequence[Solid], spacing: float = 0.002) -> np.ndarray:
+    """How far points spread evenly over the outer surface of solids are from the surface of others, metres, [n]."""
+    return np.abs(union_distance(others, surface_points(solids, spacing)))

@@ -22,12 +22,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from mujoco import mjx
 
 from vecenv.controllers import gripper as gripper_control
 from vecenv.controllers import kinematics, osc, waypoint
-from vecenv.libero import goals
+from vecenv.controllers.rotations import quat_to_mat
+from vecenv.libero import cache, goals
 from vecenv.libero.scene import HOME_QPOS, Scene
 from vecenv.physics import budgets
 from vecenv.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Followed, Physics, Ran, Start, Watcher
@@ -196,6 +197,7 @@ def build(
         MjxError: see ``resolve_impl``; or the arm does not come first.
     """
     chosen = resolve_impl(impl)
+    _remember_compilations()
     if [*scene.arm_qpos, *scene.finger_qpos] != list(range(_ROBOT)):
         raise MjxError("the arm and its fingers must be the scene's first joints")
     model = budget.limited(scene.model)
@@ -207,6 +209,13 @@ def build(
     home_qpos = jnp.array([*HOME_QPOS, 0.0, 0.0], jnp.result_type(float))
     home = jax.jit(kinematics.arm_state)(chain, home_qpos, jnp.zeros_like(home_qpos))
     return Build(scene=scene, model=model, impl=chosen, budget=budget, system=System(put, chain, home))
+
+
+def _remember_compilations() -> None:
+    """Turn JAX's persistent compilation cache on, in the user's cache folder, unless a folder was already chosen."""
+    folder = cache.folder()
+    if jax.config.values.get("jax_compilation_cache_dir") is None and folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder.with_name("jax")))
 
 
 def new_world(system: System, blank: mjx.Data) -> World:
@@ -241,7 +250,7 @@ def start_world(
     data = _cleared(world.data, qpos, qvel, time)
     opened = jnp.asarray(_OPEN, fresh.gripper.dtype)
     world = fresh._replace(
-        data=forward(system, world._replace(data=data)),
+        data=_placed(system, world._replace(data=data)),
         body_pos=world.body_pos,
         body_quat=world.body_quat,
         gripper=jnp.where(settled, opened, 0.0),
@@ -268,6 +277,27 @@ def forward(system: System, world: World) -> mjx.Data:
     """Kinematics, contacts and contact sensors of the present state."""
     with jax.default_matmul_precision("highest"):
         return mjx.forward(_own_model(system, world), world.data)
+
+
+def _placed(system: System, world: World) -> mjx.Data:
+    """``forward`` after bodies may have been moved.
+
+    Warp computes geoms that are fixed to the world once, when data is made, wherever ``body_pos`` puts their bodies
+    later: a fixture would collide where the model has it. Here they follow their bodies.
+    """
+    data = forward(system, world)
+    if data.impl != mjx.Impl.WARP:
+        return data
+    model = system.model
+    body = np.asarray(model.geom_bodyid)
+    fixed = (np.asarray(model.body_weldid)[body] == 0)[:, None]
+    turned = data.xmat.reshape(-1, 3, 3)[body]
+    own = jax.vmap(quat_to_mat)(model.geom_quat)
+    pos = data.xpos[body] + (turned * model.geom_pos[:, None]).sum(-1)
+    mat = (turned[..., None] * own[:, None]).sum(-2)
+    xpos = jnp.where(fixed, pos, data.geom_xpos)
+    xmat = jnp.where(fixed[..., None], mat, data.geom_xmat.reshape(-1, 3, 3)).reshape(data.geom_xmat.shape)
+    return forward(system, world._replace(data=data.replace(geom_xpos=xpos, geom_xmat=xmat)))
 
 
 def _own_model(system: System, world: World) -> mjx.Model:
@@ -619,9 +649,11 @@ class MjxGroup:
         devices = 1 if mesh is None else mesh.size
         # Every device takes as many worlds; those past the last slot never move.
         self.num_worlds = -(-len(slots) // devices) * devices
-        blank = built.blank(self.num_worlds // devices)
+        self.system, blank = built.system, built.blank(self.num_worlds // devices)
+        if mesh is not None:
+            self.system, blank = jax.device_put((self.system, blank), NamedSharding(mesh, PartitionSpec()))
         qpos = self.put(np.tile(np.asarray(blank.qpos), (len(slots), 1)))
-        self.worlds: World = self.compiled.create(built.system, blank, qpos)
+        self.worlds: World = self.compiled.create(self.system, blank, qpos)
         self.table: goals.GoalTable | None = None
         self._fresh: mjx.Data | None = None
         self._fetched: dict[str, np.ndarray] = {}
@@ -708,7 +740,7 @@ class MjxGroup:
 
     def refresh_all(self) -> None:
         """Bring kinematics, contacts and contact sensors up to the present state."""
-        self._fresh, self._fetched = self.compiled.forward(self.built.system, self.worlds), {}
+        self._fresh, self._fetched = self.compiled.forward(self.system, self.worlds), {}
 
 
 @functools.lru_cache(maxsize=64)
@@ -780,13 +812,13 @@ class MjxPhysics(Physics):
         qpos[rows], qvel[rows] = start.qpos, start.qvel
         state = (qpos, qvel, np.full(n, start.time), np.full(n, start.settled))
         arrays = jax.tree.map(group.put, (bodies, state))
-        group.replace(group.compiled.start(group.built.system, group.worlds, group.put_mask(mask), *arrays))
+        group.replace(group.compiled.start(group.system, group.worlds, group.put_mask(mask), *arrays))
         self._collect_faults()
 
     def write_state(self, group: MjxGroup, qpos: np.ndarray, qvel: np.ndarray, time: np.ndarray) -> None:
         """Overwrite the physics state of a group ([n, nq], [n, nv], seconds [n]); the controller keeps its memory."""
         arrays = map(group.put, (qpos, qvel, time))
-        group.replace(group.compiled.write(group.built.system, group.worlds, *arrays))
+        group.replace(group.compiled.write(group.system, group.worlds, *arrays))
         self._collect_faults()
 
     def control_step(self, actions: np.ndarray, active: np.ndarray) -> None:
@@ -801,7 +833,7 @@ class MjxPhysics(Physics):
 
         def call(group: MjxGroup) -> tuple[Loop, None]:
             rows = group.put(chunk[group.slots]), group.put_mask(active[group.slots]), group.put(limit[group.slots])
-            return group.compiled.run(group.built.system, _table(group), group.worlds, *rows), None
+            return group.compiled.run(group.system, _table(group), group.worlds, *rows), None
 
         ran, _ = self._each(active, call)
         for k in range(chunk.shape[1]):
@@ -832,7 +864,7 @@ class MjxPhysics(Physics):
             own = jax.tree.map(lambda x: group.put(np.asarray(x)[group.slots]), plan)
             rows = own, group.put_mask(active[group.slots]), group.put(limit[group.slots])
             follow = group.compiled.follow(config, traced)
-            loop, *rest = follow(group.built.system, misses, _table(group), group.worlds, *rows)
+            loop, *rest = follow(group.system, misses, _table(group), group.worlds, *rows)
             return loop, rest
 
         ran, results = self._each(active, call)
