@@ -158,7 +158,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         command.error(f"--restore {args.restore}: no such folder")
     try:
         env = make_env(args)
-    except (ValueError, KeyError, RuntimeError) as error:
+    except (ValueError, LookupError, RuntimeError) as error:
         command.error(str(error))
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "config.json").write_text(json.dumps(vars(args), indent=1, default=str))

@@ -117,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     jax.config.update("jax_enable_x64", not args.float32)
     try:
         env = make_env(args.suite, args.task, args.mode, args.scenes)
-    except (ValueError, KeyError, RuntimeError) as error:
+    except (ValueError, LookupError, RuntimeError) as error:
         command.error(str(error))
     state = functional.jit(env.reset)(jax.random.key(args.seed))
     # Away from -1 and 1, where actions are clipped, and from the gripper's 0.

@@ -489,12 +489,11 @@ def read_rows(path: Path, until: int) -> list[Row]:
     return [row for row in rows if row["env_steps"] <= until]
 
 
-def write_rows(path: Path, rows: Sequence[Row], *, append: bool) -> None:
-    """Write rows of a curve, behind what is there or in place of it."""
-    with path.open("a" if append else "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0] if rows else ())
-        if not append:
-            writer.writeheader()
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write a curve."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
         writer.writerows({name: f"{value:.10g}" for name, value in row.items()} for row in rows)
 
 
@@ -562,7 +561,7 @@ def train(
     for number in range(done + 1, config.iterations + 1):
         learner, *measured = step(learner, jnp.ones(()))
         rows.append(_row(number, config, seconds + _since(began, measured), *measured))
-        write_rows(out / "curve.csv", rows if len(rows) == 1 else rows[-1:], append=len(rows) > 1)
+        write_rows(out / "curve.csv", rows)
         report(_line(rows[-1]))
         if time.perf_counter() - saved > checkpoint_seconds or number == config.iterations:
             save(out / "checkpoint.npz", learner, iterations=number, seconds=rows[-1]["seconds"])
@@ -694,7 +693,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         args.out.mkdir(parents=True, exist_ok=True)
         (args.out / SETTINGS).write_text(json.dumps({**vars(args), "out": str(args.out)}, indent=1))
         trained = train(Upright(env) if args.action == "position" else env, config, args.out, resume=args.resume)
-    except (ValueError, KeyError, RuntimeError) as error:
+    except (ValueError, LookupError, RuntimeError) as error:
         # What these say is meant for users; anything else is a defect and keeps its traceback.
         if not type(error).__module__.startswith(("vecenv", __name__)):
             raise

@@ -12,7 +12,7 @@ import numpy as np
 
 from eval.episodes import Suite
 from eval.runner import Simulator
-from vecenv.contract import Control, EePoseControl, Egocentric, Metrics, Objects, ResetInfo
+from vecenv.contract import Control, EePoseControl, Egocentric, Metrics, Objects, PlanControl, ResetInfo
 
 SUITE = "fake_suite"
 
@@ -103,6 +103,10 @@ class FakeEnv:
     def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
         control = self.step_continuous(np.zeros((self.num_envs, 7)))
         return EePoseControl(**vars(control), error=("",) * self.num_envs)
+
+    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
+        control = self.step_continuous(np.zeros((self.num_envs, 7)))
+        return PlanControl(**vars(control), error=("",) * self.num_envs)
 
     def observe_egocentric(self) -> Egocentric:
         return Egocentric(state=np.zeros((self.num_envs, 8), np.float32))
