@@ -28,7 +28,7 @@ from vecenv.libero import functional
 
 AXES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 # Of the solver and its line search, by mode.
-ITERATIONS = {"forward": (4, 8), "reverse": (1, 8)}
+ITERATIONS = {"forward": (10, 20), "reverse": (1, 20)}
 
 
 def make_env(suite: str, task: int, mode: str, scenes: str | None = None) -> functional.LiberoEnv:

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vecenv import interop
+
 pytest.importorskip("optax")
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -260,6 +262,8 @@ def test_a_wrong_option_of_ppo_is_named(
 def test_a_missing_extra_is_named(name: str, missing: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
     monkeypatch.delitem(sys.modules, "vecenv.interop.playground", raising=False)
+    # An import of a module looks at its package's attributes first.
+    monkeypatch.delattr(interop, "playground", raising=False)
     with pytest.raises(SystemExit, match=rf"{message}.*vecenv\[train\]"):
         imported(name)
 

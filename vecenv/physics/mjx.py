@@ -54,11 +54,14 @@ class System(NamedTuple):
         model: the MJX model.
         chain: constants of the arm.
         home: the arm as the controller first sees it in upstream's reset: at home, at rest, fingers at 0.
+        touching: geoms of the two things whose contacts each sensor counts, bool [nsensordata, 2, ngeom]; only for
+            ``impl="jax"``, which knows no contact sensors of subtrees.
     """
 
     model: mjx.Model
     chain: kinematics.Chain
     home: osc.ArmState
+    touching: jax.Array | None = None
 
 
 class World(NamedTuple):
@@ -202,13 +205,52 @@ def build(
         raise MjxError("the arm and its fingers must be the scene's first joints")
     model = budget.limited(scene.model)
     model.opt.iterations, model.opt.ls_iterations = iterations
+    touching = _without_contact_sensors(model) if chosen == "jax" else None
     put = mjx.put_model(model, impl=chosen)
     if chosen == "warp":
         put = put.replace(opt=put.opt.tree_replace({"_impl.warn_overflow": 0}))
     chain = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), kinematics.chain_from_model(scene.model))
     home_qpos = jnp.array([*HOME_QPOS, 0.0, 0.0], jnp.result_type(float))
     home = jax.jit(kinematics.arm_state)(chain, home_qpos, jnp.zeros_like(home_qpos))
-    return Build(scene=scene, model=model, impl=chosen, budget=budget, system=System(put, chain, home))
+    return Build(scene=scene, model=model, impl=chosen, budget=budget, system=System(put, chain, home, touching))
+
+
+def _without_contact_sensors(model: mujoco.MjModel) -> jax.Array:
+    """Make clocks of a model's contact sensors; returns what they watched, see ``System.touching``."""
+    ancestors = [_ancestors(model, int(body)) for body in model.geom_bodyid]
+    watched = np.zeros((model.nsensordata, 2, model.ngeom), bool)
+    for sensor in np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT):
+        row = watched[model.sensor_adr[sensor]]
+        roots = model.sensor_objid[sensor], model.sensor_refid[sensor]
+        for side, root in enumerate(roots):
+            row[side] = [root in above for above in ancestors]
+        model.sensor_type[sensor] = mujoco.mjtSensor.mjSENS_CLOCK
+        model.sensor_needstage[sensor] = mujoco.mjtStage.mjSTAGE_POS
+        model.sensor_objtype[sensor] = model.sensor_reftype[sensor] = mujoco.mjtObj.mjOBJ_UNKNOWN
+        model.sensor_objid[sensor] = model.sensor_refid[sensor] = -1
+    return jnp.asarray(watched)
+
+
+def _ancestors(model: mujoco.MjModel, body: int) -> set[int]:
+    """A body and those above it, the world left out."""
+    found = set()
+    while body > 0:
+        found.add(body)
+        body = int(model.body_parentid[body])
+    return found
+
+
+def _sensed(system: System, data: mjx.Data) -> mjx.Data:
+    """Data whose contact sensors hold the numbers of contacts, also with ``impl="jax"``."""
+    if system.touching is None or not system.touching.shape[0]:
+        return data
+    contact = data._impl.contact
+    if contact.dist.shape[0] == 0:
+        return data.replace(sensordata=jnp.zeros_like(data.sensordata))
+    first, second = (system.touching[:, :, contact.geom[:, side]] for side in (0, 1))
+    between = (first[:, 0] & second[:, 1]) | (first[:, 1] & second[:, 0])
+    found = between & (contact.dist < contact.includemargin)
+    return data.replace(sensordata=found.sum(1).astype(data.sensordata.dtype))
 
 
 def _remember_compilations() -> None:
@@ -276,7 +318,7 @@ def _cleared(data: mjx.Data, qpos: jax.Array, qvel: jax.Array, time: jax.Array) 
 def forward(system: System, world: World) -> mjx.Data:
     """Kinematics, contacts and contact sensors of the present state."""
     with jax.default_matmul_precision("highest"):
-        return mjx.forward(_own_model(system, world), world.data)
+        return _sensed(system, mjx.forward(_own_model(system, world), world.data))
 
 
 def _placed(system: System, world: World) -> mjx.Data:
@@ -342,7 +384,7 @@ def _control_step(system: System, world: World, action: jax.Array, active: jax.A
 
     carry = (world.data, world.gripper, jnp.zeros((), jnp.int32))
     (data, fingers, fault), seen = lax.scan(substep, carry, jnp.arange(SUBSTEPS))
-    fault = fault | jnp.where(_stable(data), 0, _UNSTABLE)
+    data, fault = _sensed(system, data), fault | jnp.where(_stable(data), 0, _UNSTABLE)
     pos, quat, finger_pos = seen
     after = world._replace(
         goal=goal,
