@@ -20,12 +20,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 from vecenv.libero.geometry import PROFILES
 from vecenv.libero.objectives import OBJECTIVES
 
 try:
     from brax.training.agents.ppo import networks
     from brax.training.agents.ppo import train as ppo
+    from mujoco_playground import State, wrapper
 
     from vecenv.interop import playground
 except ImportError as error:
@@ -43,6 +47,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--target", help="what to reach or lift; the first object the task is about by default")
     made.add_argument("--geometry", choices=PROFILES, default="lean")
     made.add_argument("--impl", choices=("auto", "jax", "warp"), default="auto", help="auto: warp on CUDA, else jax")
+    made.add_argument("--action", choices=("position", "osc"), default="position", help="position: without rotations")
     made.add_argument("--randomize", action="store_true", help="physics of its own for every world")
     made.add_argument("--scenes", help="a folder that `vecenv compile` wrote, in place of the installed packages")
     made.add_argument("--steps", type=_whole, default=3_000_000, help="environment steps to train for")
@@ -72,12 +77,26 @@ def _whole(text: str) -> int:
     return int(number)
 
 
-def make_env(args: argparse.Namespace) -> playground.PlaygroundEnv:
+class Upright(wrapper.Wrapper):
+    """An environment whose actions have four numbers, position and gripper; the hand never turns."""
+
+    @property
+    def action_size(self) -> int:
+        """Width of an action."""
+        return 4
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advance by one step; ``action`` is [4]."""
+        return self.env.step(state, jnp.zeros(7, action.dtype).at[jnp.array([0, 1, 2, 6])].set(action))
+
+
+def make_env(args: argparse.Namespace) -> Any:
     """The environment that the command line asks for, with the shaped reward."""
     options: dict[str, Any] = {name: getattr(args, name) for name in ("objective", "geometry", "episode_length")}
     given = {"target": args.target, "scenes": args.scenes, "impl": None if args.impl == "auto" else args.impl}
     options |= {name: value for name, value in given.items() if value is not None}
-    return playground.load(f"Libero/{args.suite}/{args.task}", config_overrides={"reward": "shaped", **options})
+    env = playground.load(f"Libero/{args.suite}/{args.task}", config_overrides={"reward": "shaped", **options})
+    return Upright(env) if args.action == "position" else env
 
 
 class Curve:
@@ -110,15 +129,14 @@ class Curve:
         print("  ".join(f"{name} {value:,.3f}" for name, value in row.items()), flush=True)
 
 
-def train(env: playground.PlaygroundEnv, args: argparse.Namespace) -> Any:
+def train(env: Any, args: argparse.Namespace) -> Any:
     """Train; returns what Brax's ``train`` does: a maker of policies, parameters and the last metrics."""
     playground.mend_brax()
     checkpoints = (args.out / "checkpoints").resolve()
     checkpoints.mkdir(parents=True, exist_ok=True)
     widths = tuple(args.hidden)
-    trained: Any = env
     return ppo.train(
-        environment=trained,
+        environment=env,
         wrap_env_fn=playground.wrap_for_training,
         randomization_fn=playground.randomize if args.randomize else None,
         num_timesteps=args.steps,
