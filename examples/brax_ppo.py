@@ -22,6 +22,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from mujoco import mjx
 
 from vecenv.libero.geometry import PROFILES
 from vecenv.libero.objectives import OBJECTIVES
@@ -88,6 +89,21 @@ class Upright(wrapper.Wrapper):
     def step(self, state: State, action: jax.Array) -> State:
         """Advance by one step; ``action`` is [4]."""
         return self.env.step(state, jnp.zeros(7, action.dtype).at[jnp.array([0, 1, 2, 6])].set(action))
+
+    # Domain randomisation puts another model into what `unwrapped` returns, and steps that.
+
+    @property
+    def unwrapped(self) -> Any:
+        """This environment."""
+        return self
+
+    @property
+    def _mjx_model(self) -> mjx.Model:
+        return self.env._mjx_model
+
+    @_mjx_model.setter
+    def _mjx_model(self, model: mjx.Model) -> None:
+        self.env._mjx_model = model
 
 
 def make_env(args: argparse.Namespace) -> Any:
