@@ -3,6 +3,8 @@
 For every scene, geometry and batch size: the environment runs chunks of random actions; the bare loop steps the same
 number of substeps from the same states, with the last commands held and the same memory. Both are compiled; the two
 take turns. Also: seconds to compile, device memory, and how many worlds ran out of contact or constraint memory.
+
+With ``--devices N`` the batch is spread over N devices, and the other side is one device with its share of it.
 """
 
 from __future__ import annotations
@@ -66,26 +68,19 @@ def arguments() -> argparse.Namespace:
 
 def measure(scene: str, geometry: str, batch: int, options: argparse.Namespace) -> dict[str, Any]:
     """One row."""
-    suite, task = scene.rsplit("/", 1)
-    episodes = [i % 50 for i in range(batch)]
     before = used_memory()
     start = time.perf_counter()
-    env = vecenv.make(
-        suite,
-        task=int(task),
-        episodes=episodes,
-        backend=options.backend,
-        geometry=geometry,
-        num_devices=options.devices,
-        scenes=options.scenes,
-    )
-    env.reset()
+    env = ready_env(scene, geometry, batch, options.devices, options)
     ready = time.perf_counter() - start
-    assert isinstance(env, LiberoEnv)
     group: MjxGroup = env.physics.groups[0]
     ours, compile_seconds = timed_first(environment(group))
     memory = used_memory() - before
-    theirs, _ = timed_first(bare(group)) if options.devices == 1 else (None, 0.0)
+    if options.devices > 1:
+        return compare_devices(ours, env, scene, geometry, batch, options) | {
+            "ready s": round(ready, 1),
+            "compile s": round(compile_seconds, 1),
+        }
+    theirs, _ = timed_first(bare(group))
     rates = alternate([ours, theirs], options.rounds, options.seconds)
     failed = int((np.asarray(group.worlds.fault) != 0).sum())
     row = {
@@ -96,10 +91,9 @@ def measure(scene: str, geometry: str, batch: int, options: argparse.Namespace) 
             (np.asarray(group.scene.model.geom_contype) | np.asarray(group.scene.model.geom_conaffinity) > 0).sum()
         ),
         "B": batch,
-        "devices": options.devices,
-        "env / bare": round(rates[0] / rates[1], 3) if rates[1] else "-",
+        "env / bare": round(rates[0] / rates[1], 3),
         "env steps/s": round(rates[0] * batch * CHUNK),
-        "bare steps/s": round(rates[1] * batch * CHUNK) if rates[1] else "-",
+        "bare steps/s": round(rates[1] * batch * CHUNK),
         "ready s": round(ready, 1),
         "compile s": round(compile_seconds, 1),
         "MiB a world": round(memory / batch, 2) if memory else "-",
@@ -107,6 +101,46 @@ def measure(scene: str, geometry: str, batch: int, options: argparse.Namespace) 
     }
     env.close()
     return row
+
+
+def ready_env(scene: str, geometry: str, batch: int, devices: int, options: argparse.Namespace) -> LiberoEnv:
+    """A batch at its starts."""
+    suite, task = scene.rsplit("/", 1)
+    env = vecenv.make(
+        suite,
+        task=int(task),
+        episodes=[i % 50 for i in range(batch)],
+        backend=options.backend,
+        geometry=geometry,
+        num_devices=devices,
+        scenes=options.scenes,
+    )
+    assert isinstance(env, LiberoEnv)
+    env.reset()
+    return env
+
+
+def compare_devices(
+    ours: Callable[[], Any], env: LiberoEnv, scene: str, geometry: str, batch: int, options: argparse.Namespace
+) -> dict[str, Any]:
+    """A row: the batch over several devices against its share on one."""
+    share = batch // options.devices
+    single = ready_env(scene, geometry, share, 1, options)
+    alone, _ = timed_first(environment(single.physics.groups[0]))
+    rates = alternate([ours, alone], options.rounds, options.seconds)
+    failed = sum(int((np.asarray(e.physics.groups[0].worlds.fault) != 0).sum()) for e in (env, single))
+    for each in (env, single):
+        each.close()
+    return {
+        "scene": scene,
+        "geometry": geometry,
+        "B": batch,
+        "devices": options.devices,
+        "all / one": round(rates[0] * batch / (rates[1] * share), 3),
+        "env steps/s": round(rates[0] * batch * CHUNK),
+        "one device steps/s": round(rates[1] * share * CHUNK),
+        "faults": failed,
+    }
 
 
 def environment(group: MjxGroup) -> Callable[[], Any]:

@@ -821,7 +821,7 @@ def agreement_cells(name: str, found: Sequence[tuple[int, Row]]) -> dict[str, st
         sum(row[column] for _, row in found) for column in ("native", "here", "only native", "only here")
     )
     if not total:
-        return {f"{name}: native → here": "", "points": "", "only native / only here": ""}
+        return {f"{name}: native → here": "", f"{name}: points": "", f"{name}: only native / here": ""}
     return {
         f"{name}: native → here": f"{native} → {here} of {total}",
         f"{name}: points": f"{100 * (here - native) / total:+.1f}",

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 from mujoco import mjx
 
 from vecenv.controllers import gripper as gripper_control
@@ -32,6 +32,7 @@ from vecenv.libero import cache, goals
 from vecenv.libero.scene import HOME_QPOS, Scene
 from vecenv.physics import budgets
 from vecenv.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Followed, Physics, Ran, Start, Watcher
+from vecenv.physics.spread import Spread, replicated
 
 Impl: TypeAlias = Literal["jax", "warp"]
 
@@ -618,16 +619,8 @@ class _Compiled:
 
     def _compile(self, function: Callable[..., Any], *, shared: int = 1, **options: Any) -> Callable[..., Any]:
         """Jit a function whose first ``shared`` arguments are the same for all worlds."""
-        if self._mesh is None:
-            return jit(function, **options)
-        over_worlds = PartitionSpec(self._mesh.axis_names[0])
-
-        def sharded(*args: Any) -> Any:
-            specs = tuple(PartitionSpec() if i < shared else over_worlds for i in range(len(args)))
-            spread = jax.shard_map(function, mesh=self._mesh, in_specs=specs, out_specs=over_worlds, check_vma=False)
-            return spread(*args)
-
-        return jit(sharded, **options)
+        compiled = jit(function, **options)
+        return compiled if self._mesh is None else Spread(compiled, self._mesh, shared)
 
 
 def _create(system: System, blank: mjx.Data, qpos: jax.Array) -> World:
@@ -693,7 +686,7 @@ class MjxGroup:
         self.num_worlds = -(-len(slots) // devices) * devices
         self.system, blank = built.system, built.blank(self.num_worlds // devices)
         if mesh is not None:
-            self.system, blank = jax.device_put((self.system, blank), NamedSharding(mesh, PartitionSpec()))
+            self.system, blank = jax.device_put((self.system, blank), replicated(mesh))
         qpos = self.put(np.tile(np.asarray(blank.qpos), (len(slots), 1)))
         self.worlds: World = self.compiled.create(self.system, blank, qpos)
         self.table: goals.GoalTable | None = None
