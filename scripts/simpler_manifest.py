@@ -1,0 +1,104 @@
+"""Write ``vecenv/simpler/manifest.json``: the files that SIMPLER's tasks open, with their sizes and hashes.
+
+In: an asset tree in the layout of ManiSkill2_real2sim, and a clone of that repository. Every file of the tree is
+listed, and must have the content that the repository's commit has at that path. What the tasks open but the tree lacks
+(some meshes, and the textures beside them) is read from the clone; where the clone is partial and lacks it too, Git's
+identifier of the content is recorded alone, which still verifies a download.
+
+    python scripts/simpler_manifest.py TREE --git CLONE [--commit COMMIT]
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path, PurePosixPath
+
+from vecenv.simpler import assets
+from vecenv.simpler.tasks import TASKS
+
+COMMIT = "ef7a4d4fdf4b69f2c2154db5b15b9ac8dfe10682"
+# Objects that move_near and pick draw from a mesh in a file of this name; the others' are in the tree.
+_MISSING_VISUALS = (
+    "baked_opened_redbull_can",
+    "baked_opened_redbull_can_v2",
+    "blue_plastic_bottle",
+    "eggplant",
+    "opened_redbull_can",
+    "redbull_can",
+)
+
+
+def main() -> None:
+    """Read the arguments, compare, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tree", type=Path)
+    parser.add_argument("--git", type=Path, required=True, help="clone of ManiSkill2_real2sim")
+    parser.add_argument("--commit", default=COMMIT)
+    parser.add_argument("--out", type=Path, default=assets.MANIFEST)
+    options = parser.parse_args()
+    blobs = git_blobs(options.git, options.commit)
+    wanted: dict[str, str | None] = {**needed(blobs), **dict.fromkeys(files(options.tree))}
+    rows = [row(options, path, blobs, wanted[path]) for path in sorted(wanted)]
+    lines = ",\n  ".join(json.dumps(entry) for entry in rows)
+    options.out.write_text(f'{{"commit": "{options.commit}", "files": [\n  {lines}\n]}}\n')
+    absent = [str(entry["path"]) for entry in rows if "sha256" not in entry]
+    print(f"{len(rows)} files, {len(absent)} of them only with Git's identifier:", *absent, sep="\n  ")
+
+
+def files(tree: Path) -> list[str]:
+    """Files of the tree, relative."""
+    return [file.relative_to(tree).as_posix() for file in tree.rglob("*") if file.is_file()]
+
+
+def needed(blobs: dict[str, str]) -> dict[str, str | None]:
+    """Files that the tasks open and that a tree may lack -> the file that uses them, None for the simulator itself."""
+    found: dict[str, str | None] = {str(task.stage.mesh): None for task in TASKS.values() if task.stage.mesh}
+    for model in _MISSING_VISUALS:
+        folder = f"data/custom/models/{model}/"
+        mesh = f"{folder}textured.dae"
+        images = [path for path in blobs if path.startswith(folder) and path.endswith((".png", ".jpg"))]
+        found |= {mesh: None, **dict.fromkeys(images, mesh)}
+    return found
+
+
+def git_blobs(clone: Path, commit: str) -> dict[str, str]:
+    """Path -> Git's identifier of its content, in a commit."""
+    listed = _git(clone, "ls-tree", "-r", commit)
+    assert listed is not None, f"{clone} has no commit {commit}"
+    return {line.partition("\t")[2]: line.split()[2] for line in listed.decode().splitlines()}
+
+
+def row(options: argparse.Namespace, path: str, blobs: dict[str, str], used_by: str | None) -> dict[str, str | int]:
+    """One line of the manifest."""
+    if path not in blobs:
+        sys.exit(f"{path} is not in the repository's commit")
+    content = _content(options, path, blobs[path])
+    use = {"used_by": used_by} if used_by else {}
+    if content is None:
+        return {"path": path, "git_blob": blobs[path], **use}
+    return {"path": path, "size": len(content), "sha256": hashlib.sha256(content).hexdigest(), **use}
+
+
+def _content(options: argparse.Namespace, path: str, blob: str) -> bytes | None:
+    file = options.tree / path
+    if not file.is_file():
+        return _git(options.git, "cat-file", "blob", blob)
+    if not assets.Entry(path=PurePosixPath(path), git_blob=blob).matches(file):
+        sys.exit(f"{file} is not the file of the repository's commit")
+    return file.read_bytes()
+
+
+def _git(clone: Path, *arguments: str) -> bytes | None:
+    """What git prints; None where it fails. A partial clone is not to fetch what it lacks."""
+    command = ["git", "-C", str(clone), *arguments]
+    done = subprocess.run(command, check=False, capture_output=True, env={**os.environ, "GIT_NO_LAZY_FETCH": "1"})
+    return done.stdout if done.returncode == 0 else None
+
+
+if __name__ == "__main__":
+    main()
