@@ -1,0 +1,347 @@
+"""What a model-written program may hold, and how much of it: kinds of values, limits, and the meters that count.
+
+In: values as they come into being while ``voxposer.sandbox`` interprets a program. Out: the same values, or a
+``Refusal`` with the rule it breaks. Sizes are checked before anything is allocated. Nothing here knows about syntax;
+the interpreter adds the line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+
+# Meters of the array work one interpreter step stands for: a thousand elements take about as long as one node.
+ELEMENTS_A_STEP = 1000
+# Steps between two looks at the clock.
+_STEPS_A_LOOK = 500
+# Bytes counted for an item of a list, a tuple of two numbers included, and for a character.
+_ITEM_BYTES, _CHARACTER_BYTES = 100, 4
+# NumPy's ways to print or roll an array grow exponentially with this.
+_DIMENSIONS = 8
+
+
+class Refusal(Exception):
+    """A program asked for something it may not have.
+
+    Attributes:
+        rule: short name of the rule, one of ``voxposer.sandbox.RULES``.
+        reason: what was asked and what would be right.
+    """
+
+    def __init__(self, rule: str, reason: str) -> None:
+        super().__init__(f"{reason} [{rule}]")
+        self.rule, self.reason = rule, reason
+
+
+class HostFault(Exception):
+    """An error that is no fault of the program: it passes through the interpreter unchanged."""
+
+
+class Record(ABC):
+    """A value of the host whose named fields programs may read, as ``x.name`` or ``x["name"]``; they never write."""
+
+    @abstractmethod
+    def fields(self) -> Collection[str]:
+        """The names a program may read."""
+
+    @abstractmethod
+    def __getitem__(self, name: str, /) -> Any:
+        """The field's value; arrays are the reader's own copies."""
+
+
+class RecordList(Sequence[Record]):
+    """Several records: programs take its length, index it and loop over it."""
+
+
+class Opaque:
+    """A value of the host that programs may keep and hand to the host's functions, and nothing else."""
+
+
+class DType:
+    """A number type that a program names, as in ``x.astype(int)``: an argument, not a value."""
+
+    def __init__(self, name: str, dtype: type[np.generic]) -> None:
+        self.name, self.dtype = name, dtype
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """How much a program may use.
+
+    Attributes:
+        source_chars: characters of source.
+        nesting: levels of syntax, and of lists in lists.
+        steps: nodes interpreted, with a thousand array elements worked on counted as one more; shared by the programs
+            that one program calls.
+        calls: calls of the host's functions and reads of its records; shared likewise.
+        programs: further programs that the model is asked for; shared likewise.
+        seconds: time spent in programs, the host's own time not counted; shared likewise.
+        memory_bytes: what one run of one program makes, whether still alive or not.
+        array_elements: elements of one array.
+        items: items of a list, tuple or dictionary, and of what it holds in turn.
+        text_chars: characters of a string.
+        integer_bits: bits of an integer.
+    """
+
+    source_chars: int = 20_000
+    nesting: int = 60
+    steps: int = 1_000_000
+    calls: int = 2_000
+    programs: int = 200
+    seconds: float = 10.0
+    memory_bytes: int = 512 * 2**20
+    array_elements: int = 2**23
+    items: int = 10_000
+    text_chars: int = 10_000
+    integer_bits: int = 63
+
+
+class Budget:
+    """Steps, calls and time of a program and of all programs run on its behalf."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self._steps, self._calls, self._seconds = limits.steps, limits.calls, limits.seconds
+        self._programs = limits.programs
+        self._unseen = 0
+        self._since: float | None = None
+
+    def step(self, count: int = 1) -> None:
+        """Use up steps; look at the clock now and then."""
+        self._steps -= count
+        self._unseen += count
+        if self._steps < 0:
+            raise Refusal("steps", f"more than {self.limits.steps} steps: a loop that is too long or never ends")
+        if self._unseen >= _STEPS_A_LOOK:
+            self._unseen = 0
+            self._look()
+
+    def call(self) -> None:
+        """Use up one call of the host."""
+        self._calls -= 1
+        if self._calls < 0:
+            raise Refusal("calls", f"more than {self.limits.calls} calls of given functions and reads of observations")
+
+    def program(self) -> None:
+        """Use up one of the further programs that are asked for."""
+        self._programs -= 1
+        if self._programs < 0:
+            raise Refusal("calls", f"more than {self.limits.programs} further programs were asked for")
+
+    @contextlib.contextmanager
+    def clock(self, running: bool) -> Iterator[None]:
+        """Let the clock run (in a program) or stand still (in the host), and put it back afterwards."""
+        was_running = self._since is not None
+        self._set(running)
+        try:
+            yield
+        finally:
+            self._set(was_running)
+
+    def _set(self, running: bool) -> None:
+        now = time.monotonic()
+        if self._since is not None:
+            self._seconds -= now - self._since
+        self._since = now if running else None
+
+    def _look(self) -> None:
+        self._set(self._since is not None)
+        if self._seconds < 0:
+            raise Refusal("time", f"more than {self.limits.seconds} s of computing")
+
+
+class Guard:
+    """The meters of one run of one program; every function a program may call gets it first."""
+
+    def __init__(self, budget: Budget) -> None:
+        self.budget, self.limits = budget, budget.limits
+        self._memory = self.limits.memory_bytes
+
+    def hold(self, size: int) -> None:
+        """Count bytes that the program has made or is about to make."""
+        self.require_memory(size)
+        self._memory -= size
+
+    def require_memory(self, size: int) -> None:
+        """Refuse what would not fit."""
+        if size > self._memory:
+            raise Refusal("memory", f"values of more than {self.limits.memory_bytes} bytes in all")
+
+    def room(self, shape: Sequence[int], itemsize: int = 8) -> None:
+        """Refuse an array that would be too large, before it is made; the work of making it is counted."""
+        if len(shape) > _DIMENSIONS:
+            raise Refusal("size", f"an array of {len(shape)} dimensions; {_DIMENSIONS} are allowed")
+        elements = math.prod(int(length) for length in shape)
+        if elements > self.limits.array_elements:
+            raise Refusal("memory", f"an array of {elements} elements; {self.limits.array_elements} are allowed")
+        self.require_memory(elements * itemsize)
+        self.budget.step(elements // ELEMENTS_A_STEP)
+
+    def length(self, count: int) -> None:
+        """Refuse a container with too many items, before it is made."""
+        if count > self.limits.items:
+            raise Refusal("size", f"{count} items in a list; {self.limits.items} are allowed")
+
+    def characters(self, count: int) -> None:
+        """Refuse a string that would be too long, before it is made."""
+        if count > self.limits.text_chars:
+            raise Refusal("size", f"a string of {count} characters; {self.limits.text_chars} are allowed")
+
+    def bits(self, count: int) -> None:
+        """Refuse an integer that would be too large, before it is computed."""
+        if count > self.limits.integer_bits:
+            raise Refusal("size", f"an integer of more than {self.limits.integer_bits} bits")
+
+    def take(self, value: Any) -> Any:
+        """A value that has just been made, checked and its memory counted; views count as what they show."""
+        if isinstance(value, np.ndarray):
+            require_numbers(value)
+            self.room(value.shape, value.itemsize)
+            self.hold(value.nbytes)
+        elif isinstance(value, str):
+            self.characters(len(value))
+            self.hold(len(value) * _CHARACTER_BYTES)
+        elif isinstance(value, (list, tuple, dict)):
+            self.length(len(value))
+            self.hold(len(value) * _ITEM_BYTES)
+            self.budget.step(len(value) // 100)
+        elif type(value) is int:
+            self.bits(value.bit_length())
+        else:
+            kind_of(value)
+        return value
+
+    def take_all(self, value: Any) -> Any:
+        """A function's result: a list's or tuple's items are taken too."""
+        if isinstance(value, (list, tuple)):
+            self.weigh(value)
+            for item in value:
+                self.take(item)
+        return self.take(value)
+
+    def host(self, name: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        """What a function of the host returns, its time not counted.
+
+        Raises:
+            Refusal: it raised something other than a ``HostFault``, which is the cause, or returned what programs may
+                not hold.
+        """
+        self.budget.call()
+        try:
+            with self.budget.clock(running=False):
+                value = function(*arguments, **named)
+        except (HostFault, Refusal):  # a refusal comes from this budget, on which a program within drew
+            raise
+        except Exception as error:
+            raise Refusal("call", f"{name}: {type(error).__name__}: {error}") from error
+        given = any(value is argument for argument in (*arguments, *named.values()))
+        return value if given else self.take_all(value)
+
+    def weigh(self, value: Any) -> Weight:
+        """What a value holds, its lists' lists included, each counted wherever it appears.
+
+        Shared lists can stand for exponentially many items, and a list may hold itself: what is handed to a function
+        that walks lists goes through here first.
+
+        Raises:
+            Refusal: there are too many, they nest too deep, or one is no value a program may hold.
+        """
+        pending: list[tuple[Any, int]] = [(value, 0)]
+        seen, leaves = 0, []
+        while pending:
+            item, depth = pending.pop()
+            seen += 1
+            if isinstance(item, (list, tuple, dict)):
+                if depth >= self.limits.nesting or seen + len(pending) + len(item) > self.limits.items + 1:
+                    raise Refusal("size", f"lists nested too deep or with more than {self.limits.items} items in all")
+                pending.extend((child, depth + 1) for child in _children(item))
+            else:
+                leaves.append(item)
+        self.budget.step(seen // 10)
+        return Weight(
+            numbers=sum(_numbers_in(leaf) for leaf in leaves),
+            characters=sum(len(leaf) for leaf in leaves if isinstance(leaf, str)),
+            kinds=frozenset(kind_of(leaf) for leaf in leaves),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weight:
+    """What ``Guard.weigh`` counted.
+
+    Attributes:
+        numbers: numbers and elements of arrays and ranges.
+        characters: characters of all strings.
+        kinds: kinds of value that appear, other than lists, tuples and dictionaries.
+    """
+
+    numbers: int
+    characters: int
+    kinds: frozenset[str]
+
+
+def _children(container: list[Any] | tuple[Any, ...] | dict[Any, Any]) -> Iterable[Any]:
+    return [*container.keys(), *container.values()] if isinstance(container, dict) else container
+
+
+def _numbers_in(leaf: Any) -> int:
+    if isinstance(leaf, np.ndarray):
+        return leaf.size
+    return len(leaf) if isinstance(leaf, range) else 1
+
+
+_KINDS: dict[type, str] = {
+    type(None): "None",
+    bool: "number",
+    int: "number",
+    float: "number",
+    str: "text",
+    list: "list",
+    tuple: "tuple",
+    dict: "dictionary",
+    range: "range",
+}
+
+
+def kind_of(value: Any) -> str:
+    """What a program calls this value: number, array, text, list, tuple, dictionary, range, observation, map, None.
+
+    Raises:
+        Refusal: no program may hold it.
+    """
+    kind = _KINDS.get(type(value))
+    if kind is not None:
+        return kind
+    if isinstance(value, (np.ndarray, np.generic)):
+        require_numbers(value)
+        return "array" if isinstance(value, np.ndarray) else "number"
+    for of_host, name in ((Record, "observation"), (RecordList, "observations"), (Opaque, "map")):
+        if isinstance(value, of_host):
+            return name
+    if isinstance(value, DType):
+        raise Refusal("values", f"{value.name} is a type: it may stand for a dtype or be called, but is no value")
+    raise Refusal("values", f"{type(value).__name__} is no kind of value a program may hold")
+
+
+def require_numbers(value: np.ndarray | np.generic) -> None:
+    """Refuse arrays of anything but truth values, integers and floats."""
+    if value.dtype.kind not in "biuf":
+        raise Refusal("values", f"an array of {value.dtype}; only truth values, integers and floats are allowed")
+
+
+def refuse_kind(value: Any, wanted: str) -> NoReturn:
+    """Refuse a value where another kind is wanted."""
+    raise Refusal("types", f"expected {wanted}, got {_article(kind_of(value))}")
+
+
+def _article(kind: str) -> str:
+    if kind in ("None", "text", "observations"):
+        return kind
+    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
