@@ -30,6 +30,8 @@ from vecenv.physics.base import SUBSTEPS
 from vecenv.physics.mjx import MjxGroup, jit
 
 CHUNK = 10
+# How XLA, CUDA and Warp say it.
+OUT_OF_MEMORY = ("resource_exhausted", "out of memory", "failed to allocate")
 
 
 def main() -> None:
@@ -41,7 +43,7 @@ def main() -> None:
         try:
             rows.append(measure(scene, geometry, batch, options))
         except Exception as error:
-            if "RESOURCE_EXHAUSTED" not in str(error) and "out of memory" not in str(error).lower():
+            if not any(sign in str(error).lower() for sign in OUT_OF_MEMORY):
                 raise
             rows.append(
                 {**dict.fromkeys(rows[0] if rows else (), "-"), "scene": scene, "geometry": geometry, "B": batch}
