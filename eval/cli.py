@@ -39,7 +39,7 @@ def eval_command(
         None, help="Suite to evaluate; `vecenv list` names them.", show_default="required"
     ),
     policy: str | None = typer.Option(
-        None, help="random, zero, pick_place, or your own module:Class.", show_default="pick_place"
+        None, help="random, zero, pick_place, voxposer, or your own module:Class.", show_default="pick_place"
     ),
     tasks: str | None = typer.Option(None, help="all, or indices and ranges: 0,3,5-7.", show_default="all"),
     episodes: str | None = typer.Option(None, help="all, a count, or indices and ranges: 0,3,5-7.", show_default="all"),

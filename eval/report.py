@@ -7,8 +7,9 @@ and counted beside it, as is one that never ran.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from rich import box
@@ -70,6 +71,8 @@ class Summary:
         setup_s: seconds spent building and placing environments.
         wall_s: seconds spent running episodes, the policy's included.
         steps_per_s: ``steps / wall_s``.
+        extras: what the policy reported (``Record.extras``), by name: the mean an episode of what is a number, how
+            often each was said of what is words.
     """
 
     suite: str
@@ -80,6 +83,7 @@ class Summary:
     setup_s: float
     wall_s: float
     steps_per_s: float
+    extras: Mapping[str, float | dict[str, int]] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
@@ -132,6 +136,7 @@ def summarise(
         setup_s=setup_s,
         wall_s=wall_s,
         steps_per_s=steps / wall_s if wall_s else 0.0,
+        extras=_extras(found),
     )
 
 
@@ -156,7 +161,10 @@ def markdown(summary: Summary) -> str:
     """The summary as a Markdown page."""
     cells = [_COLUMNS, ["---"] * len(_COLUMNS), *map(_cells, (*summary.tasks, summary.total))]
     lines = [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in cells]
-    return "\n".join([f"# {summary.suite}, policy {summary.policy}", "", *lines, "", closing_line(summary), ""])
+    extras = _extras_lines(summary)
+    reported = ["", "Reported by the policy, means an episode and counts:", "", *extras] if extras else []
+    title = f"# {summary.suite}, policy {summary.policy}"
+    return "\n".join([title, "", *lines, "", closing_line(summary), *reported, ""])
 
 
 def closing_line(summary: Summary) -> str:
@@ -186,6 +194,26 @@ def _row(task: int | str, instruction: str, records: Sequence[Record], planned: 
         errors=len(records) - len(verdicts),
         missing=planned - len(records),
     )
+
+
+def _extras(records: Sequence[Record]) -> dict[str, float | dict[str, int]]:
+    """Means of reported numbers, counts of reported words (empty ones left out)."""
+    result: dict[str, float | dict[str, int]] = {}
+    for name in dict.fromkeys(name for record in records for name in record.extras):
+        values = [record.extras[name] for record in records if record.extras.get(name) not in (None, "")]
+        numbers = [float(value) for value in values if isinstance(value, int | float)]
+        words = Counter(str(value) for value in values if not isinstance(value, int | float))
+        result[name] = dict(words.most_common()) if words else sum(numbers) / len(numbers) if numbers else {}
+    return result
+
+
+def _extras_lines(summary: Summary) -> list[str]:
+    """What the policy reported, one line a name."""
+
+    def say(value: float | dict[str, int]) -> str:
+        return "; ".join(f"{n} x {what}" for what, n in value.items()) if isinstance(value, dict) else f"{value:,.4g}"
+
+    return [f"- {name}: {say(value)}" for name, value in summary.extras.items() if value != {}]
 
 
 def _seconds(records: Iterable[Record]) -> tuple[float, float]:

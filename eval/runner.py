@@ -22,7 +22,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from eval.episodes import Batch, Episode, Suite, parse_episodes, parse_tasks, plan
-from eval.policies import Policy, make_policy
+from eval.policies import Policy, extras_of, make_policy
 from eval.report import Summary, markdown, summarise
 from eval.store import CONFIG, Record, ResultStore, StoreError
 from vecenv.cli import unknown
@@ -406,6 +406,7 @@ class _Run:
             batch=placed.batch,
             setup_s=placed.setup_s,
             wall_s=wall_s,
+            extras=extras_of(self.policy, slot),
         )
 
     def _place(self, batch: Batch) -> tuple[BatchEnv, ResetInfo]:

@@ -12,8 +12,8 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,7 @@ class Record:
         batch: which batch of that run.
         setup_s: seconds it took to place the batch (building or re-placing the environment, and reset).
         wall_s: seconds from then until this episode ended, the policy's included.
+        extras: what the policy has to say about the episode, numbers and words by name.
     """
 
     suite: str
@@ -59,6 +60,7 @@ class Record:
     batch: int = 0
     setup_s: float = 0.0
     wall_s: float = 0.0
+    extras: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def key(self) -> Episode:
@@ -192,7 +194,8 @@ def _parse(line: str, where: str) -> Record:
 
 def _finite(row: dict[str, Any]) -> dict[str, Any]:
     """JSON has no NaN or infinity: they become null."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+    finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+    return {k: _finite(v) if isinstance(v, dict) else v for k, v in finite.items()}
 
 
 def _append(path: Path, text: str) -> None:

@@ -158,3 +158,18 @@ def test_this_machine_has_what_the_core_needs() -> None:
     report = doctor.diagnose()
     assert report.ok, text_of(report)
     assert report.machine["cores"] >= 1
+
+
+def test_the_gl_that_draws_camera_images_is_named_and_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    def only_osmesa(source: str, **environment: str) -> tuple[bool, str]:
+        return environment.get("MUJOCO_GL") == "osmesa", "llvmpipe"
+
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    chosen = found(doctor.diagnose(only_osmesa), "camera images")
+    assert chosen.ok
+    assert "osmesa, on the CPU (the first that works" in chosen.detail
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    broken = found(doctor.diagnose(only_osmesa), "camera images")
+    assert not broken.ok
+    assert "MUJOCO_GL=egl, which does not work" in broken.detail
+    assert "unset MUJOCO_GL" in broken.fix

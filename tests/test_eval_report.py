@@ -124,3 +124,13 @@ def test_the_markdown_table_keeps_its_columns() -> None:
 
 def test_the_summary_is_plain_json() -> None:
     assert json.loads(json.dumps(summary(record(0, 0)).to_dict()))["total"]["rate"] == 1.0
+
+
+def test_what_the_policy_reports_is_averaged_or_counted() -> None:
+    said = [{"calls": 2, "cause": ""}, {"calls": 4, "cause": "dropped it"}, {"calls": None, "cause": "dropped it"}]
+    found = summary(*(record(0, i, extras=extras) for i, extras in enumerate(said)))
+    assert found.extras == {"calls": 3.0, "cause": {"dropped it": 2}}
+    page = markdown(found)
+    assert "- calls: 3" in page
+    assert "- cause: 2 x dropped it" in page
+    assert "Reported" not in markdown(summary(record(0, 0)))

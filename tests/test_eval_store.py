@@ -124,3 +124,12 @@ def test_only_an_empty_folder_can_be_discarded(store: ResultStore) -> None:
     (store.folder / "episodes.jsonl").write_text("")
     store.discard()
     assert not store.folder.exists()
+
+
+def test_what_a_policy_reports_is_kept_with_the_episode(store: ResultStore) -> None:
+    said = {"subtasks": 3, "cost": float("inf"), "cause": "dropped it"}
+    store.append([record(extras=said)])
+    assert store.records()[Episode("s", 0, 0)].extras == {**said, "cost": None}
+    older = (store.folder / "episodes.jsonl").read_text().replace('"extras"', '"unknown"')
+    (store.folder / "episodes.jsonl").write_text(older)
+    assert store.records()[Episode("s", 0, 0)].extras == {}

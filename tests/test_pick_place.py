@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import vecenv
-from eval.policies.grasp import Gripper, clearance, find_grasps
 from eval.policies.pick_place import PickPlacePolicy
 from eval.policies.pick_place_goals import in_order
 from eval.policies.pick_place_motion import CLOSE, Waypoint, WaypointFollower, rotation_matrices, rotation_vectors
-from eval.policies.pick_place_transfer import HOME_ROTATION, World, choose_grasp, down_facing, yaw
-from eval.policies.pick_place_transfer import TransferConfig as Margins
 from vecenv.contract import BatchEnv, Egocentric, Metrics, Objects, ObjectsSnapshot, PointCloud, ResetInfo
+from voxposer.grasps import Gripper, clearance, find_grasps
+from voxposer.placing import choose_grasp
+from voxposer.world import HOME_ROTATION, Margins, World, down_facing, yaw
 
 Cloud = tuple[np.ndarray, np.ndarray]
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from vecenv.contract import BatchEnv
     from vecenv.libero.suites import TaskSpec
     from vecenv.physics.budgets import Budget
+    from vecenv.render.options import RenderConfig
 
 __version__ = "0.1.0"
 __all__ = ["eval_metadata", "list_suites", "list_tasks", "make"]
@@ -34,6 +35,7 @@ def make(
     num_threads: int | None = None,
     num_devices: int = 1,
     budget: Budget | None = None,
+    render: RenderConfig | None = None,
     scenes: str | Path | None = None,
 ) -> BatchEnv:
     """A batch of episodes: every one of ``episodes`` of every one of ``tasks``, task by task, one a slot.
@@ -56,6 +58,8 @@ def make(
         num_threads: threads of the native backend; None for one a core.
         num_devices: devices that MJX spreads the slots over.
         budget: contact and constraint memory on MJX; None measures each scene once and remembers it.
+        render: size and level of detail of camera images, cameras of one's own; 256 x 256 and upstream's picture by
+            default. Nothing is rendered that is not read.
         scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and no
             LIBERO or robosuite files are needed. Otherwise from the installed packages.
 
@@ -80,6 +84,7 @@ def make(
         num_devices=num_devices,
         budget=budget,
         scenes=scenes,
+        **({} if render is None else {"render": render}),
     )
 
 

@@ -20,9 +20,9 @@ Rules that hold for every environment:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -117,22 +117,81 @@ class ImagesUnavailable(LookupError):
 
 
 @dataclass(frozen=True)
+class CameraView:
+    """Where a camera of each slot is, and how it maps directions to pixels of the delivered image.
+
+    Attributes:
+        intrinsics: camera matrices [B, 3, 3]: ``intrinsics @ p`` is proportional to (x, y, 1) for a point p in the
+            camera's frame; pixel centres are at whole numbers, x counts columns and y rows from the top left.
+            The x entry is negative: delivered images are mirrored, as VLA training data are.
+        pos: position in metres, world frame, [B, 3].
+        mat: rotation to the world frame, [B, 3, 3]; columns are the camera's right, down and forward.
+    """
+
+    intrinsics: np.ndarray
+    pos: np.ndarray
+    mat: np.ndarray
+
+
+_Shown = TypeVar("_Shown")
+
+
+class Rendered(Mapping[str, _Shown]):
+    """Images (or anything else) by camera, each made when it is first read and kept.
+
+    Args:
+        names: the cameras.
+        render: makes those of several cameras at once.
+    """
+
+    def __init__(self, names: Iterable[str], render: Callable[[Sequence[str]], Mapping[str, _Shown]]) -> None:
+        self._names, self._render = tuple(names), render
+        self._made: dict[str, _Shown] = {}
+
+    def prepare(self, *names: str) -> None:
+        """Make several in one go, which takes less time than one by one."""
+        missing = [name for name in names if name in self._names and name not in self._made]
+        if missing:
+            self._made.update(self._render(missing))
+
+    def __getitem__(self, name: str) -> _Shown:
+        if name not in self._names:
+            raise KeyError(name)
+        self.prepare(name)
+        return self._made[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+@dataclass(frozen=True)
 class Egocentric:
-    """``observe_egocentric``'s return.
+    """``observe_egocentric``'s return. Mappings are by camera and may render when they are first read.
 
     Attributes:
         state: 8-D proprioception, float32 [B, 8]: end-effector position, axis-angle orientation, two finger positions.
-        images: camera images by name, uint8 [B, H, W, 3]; empty when the environment does not render.
-        depths: depth images by camera, metres, float32 [B, H, W]; likewise.
+        images: camera images, uint8 [B, H, W, 3], rotated by 180 degrees against upstream's observations, as VLA
+            training data are; empty when the environment does not render.
+        depths: distances from the camera's plane, metres, float32 [B, H, W], pixel by pixel with ``images``.
+        segmentations: index into ``instances[slot]`` of what each pixel shows, int16 [B, H, W]; likewise.
+        views: where the cameras are.
+        instances: what can be seen in each slot, B tuples of names; "" is everything that has none.
         pose: navigation pose; always None for manipulation.
-        intrinsics: camera matrices [B, 3, 3], or None.
     """
 
     state: np.ndarray
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
     depths: Mapping[str, np.ndarray] = field(default_factory=dict)
+    segmentations: Mapping[str, np.ndarray] = field(default_factory=dict)
+    views: Mapping[str, CameraView] = field(default_factory=dict)
+    instances: tuple[tuple[str, ...], ...] = ()
     pose: None = None
-    intrinsics: np.ndarray | None = None
 
     @property
     def rgb(self) -> np.ndarray:
@@ -152,6 +211,8 @@ class Egocentric:
     @property
     def observation(self) -> list[np.ndarray]:
         """The two camera images in the order policies expect: third-person, wrist."""
+        if isinstance(self.images, Rendered):
+            self.images.prepare("agentview", "wrist")
         return [self.rgb, self.wrist_image]
 
     @property
@@ -159,10 +220,43 @@ class Egocentric:
         """The third-person camera's depth, [B, H, W]; raises ``ImagesUnavailable`` where nothing renders."""
         return _camera(self.depths, "agentview", "depth image")
 
+    @property
+    def segmentation(self) -> np.ndarray:
+        """The third-person camera's instances, [B, H, W]; raises ``ImagesUnavailable`` where nothing renders."""
+        return _camera(self.segmentations, "agentview", "segmentation image")
 
-def _camera(found: Mapping[str, np.ndarray], name: str, what: str) -> np.ndarray:
+    @property
+    def intrinsics(self) -> np.ndarray | None:
+        """The third-person camera's matrices, [B, 3, 3]; None where there are no cameras."""
+        return self.views["agentview"].intrinsics if "agentview" in self.views else None
+
+    def points_from_pixels(self, camera: str, xy: np.ndarray) -> np.ndarray:
+        """World points that pixels show, metres, float64 [B, N, 3].
+
+        Args:
+            camera: a camera's name.
+            xy: columns and rows in the delivered image, int [N, 2] for all slots or [B, N, 2].
+
+        Raises:
+            ImagesUnavailable: there is no such camera.
+            IndexError: a pixel outside the image.
+        """
+        depth, view = _camera(self.depths, camera, "depth image"), _camera(self.views, camera, "view")
+        batch, height, width = depth.shape
+        pixels = np.asarray(xy)
+        pixels = np.broadcast_to(pixels, (batch, *pixels.shape[-2:]))
+        x, y = pixels[..., 0].astype(int), pixels[..., 1].astype(int)
+        if ((x < 0) | (x >= width) | (y < 0) | (y >= height)).any():
+            raise IndexError(f"a pixel lies outside the image of {width} x {height}")
+        rays = np.stack([pixels[..., 0], pixels[..., 1], np.ones(x.shape)], axis=-1)
+        rays = rays @ np.linalg.inv(view.intrinsics).transpose(0, 2, 1)
+        points = rays * depth[np.arange(batch)[:, None], y, x, None]
+        return points @ view.mat.transpose(0, 2, 1) + view.pos[:, None]
+
+
+def _camera(found: Mapping[str, _Shown], name: str, what: str) -> _Shown:
     if name not in found:
-        there = f"rendered: {', '.join(found)}" if found else "this environment renders nothing; `state` is there"
+        there = f"there are: {', '.join(found)}" if found else "this environment renders nothing; `state` is there"
         raise ImagesUnavailable(f"no {what} of camera {name!r}: {there}")
     return found[name]
 
@@ -191,6 +285,46 @@ class RegionBox:
 
 
 @dataclass(frozen=True)
+class PartJoint:
+    """The joint that moves a part.
+
+    Attributes:
+        kind: ``"slide"`` or ``"hinge"``.
+        axis: direction in which the part slides to open; or the axis about which it turns, counterclockwise seen from
+            its tip, to open or switch on. Unit vector, world frame, [3].
+        anchor: a point on the axis, world frame, [3].
+        travel: how far it opens, metres or radians.
+        opened: how far it is open now, likewise; 0 is closed or off.
+    """
+
+    kind: str
+    axis: np.ndarray
+    anchor: np.ndarray
+    travel: float
+    opened: float
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of an object or fixture that can be named: a drawer, a handle, a door, a knob, a top, a space.
+
+    Attributes:
+        parent: the thing it belongs to.
+        kind: ``"drawer"``, ``"door"``, ``"handle"``, ``"knob"``, ``"top"`` (things stand on it) or ``"space"``
+            (things go into it).
+        cloud: surface samples.
+        box: the region it is, or that moves with it; None without.
+        joint: what moves it; None where nothing does.
+    """
+
+    parent: str
+    kind: str
+    cloud: PointCloud
+    box: RegionBox | None = None
+    joint: PartJoint | None = None
+
+
+@dataclass(frozen=True)
 class ObjectsSnapshot:
     """Ground truth of one slot, as planners read it.
 
@@ -206,6 +340,7 @@ class ObjectsSnapshot:
         workspace: lower and upper corner of the workspace, [2, 3].
         targets: names the task is about (``obj_of_interest``).
         movable: the names that are not fixed to the world.
+        parts: name -> part of one of them; LIBERO's are named as ``vecenv.libero.parts`` says.
     """
 
     names: tuple[str, ...]
@@ -219,6 +354,7 @@ class ObjectsSnapshot:
     workspace: np.ndarray
     targets: tuple[str, ...] = ()
     movable: tuple[str, ...] = ()
+    parts: Mapping[str, Part] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,12 @@ for device in devices:
     print(f"{text(properties, 36)}, driver {text(driver, 20)} {text(driver, 276)}")
 """
 
+_SAPIEN_PROBE = """
+import sapien
+sapien.render.RenderMaterial()
+print(f"SAPIEN {sapien.__version__} finds a device to draw with")
+"""
+
 _JAX_PROBE = """
 import jax
 print("; ".join(f"{d.platform}:{d.id} {d.device_kind}" for d in jax.devices()))
@@ -206,6 +212,7 @@ def diagnose(run_probe: Callable[..., tuple[bool, str]] | None = None) -> Report
         _jax_check(run_probe),
         *_gl_checks(run_probe),
         _vulkan_check(run_probe),
+        *_sapien_checks(run_probe),
         *_asset_checks(),
     ]
     return Report(rows, tuple(checks), machine())
@@ -306,7 +313,22 @@ def _gl_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
         ok, text = run_probe(_GL_PROBE, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
         fix = "" if ok else f"apt-get install {wanted} (Debian, Ubuntu), or your GPU's driver"
         checks.append(Check(f"GL: {backend}", ok, False, text, fix))
-    return checks
+    return [*checks, _images_check(dict(zip(debian, checks, strict=True)))]
+
+
+def _images_check(gl: dict[str, Check]) -> Check:
+    """What camera images are drawn with: what ``MUJOCO_GL`` says, else the first that works (``vecenv.render.gl``)."""
+    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    working = [name for name, check in gl.items() if check.ok]
+    chosen = asked if asked in gl else working[0] if working else ""
+    if chosen not in working:
+        why = f"MUJOCO_GL={asked}, which does not work" if asked in gl else "no GL works"
+        fix = f"unset MUJOCO_GL, or {gl[asked].fix}" if asked in gl else gl["egl"].fix
+        return Check("camera images", False, False, f"{why}; physics needs none", fix)
+    why = "as MUJOCO_GL says" if asked == chosen else "the first that works; MUJOCO_GL=egl or osmesa overrides"
+    software = "llvmpipe" in gl[chosen].detail or "softpipe" in gl[chosen].detail
+    how = ", on the CPU" if software else ""
+    return Check("camera images", True, False, f"drawn with {chosen}{how} ({why})")
 
 
 def _vulkan_check(run_probe: Callable[..., tuple[bool, str]]) -> Check:
@@ -317,6 +339,15 @@ def _vulkan_check(run_probe: Callable[..., tuple[bool, str]]) -> Check:
         ok, devices = False, [f"{device}: too old, SAPIEN sees no device before Mesa 24.3" for device in devices]
     fix = "apt-get install libvulkan1 mesa-vulkan-drivers (24.3 or newer: bookworm-backports), or your GPU's driver"
     return Check("Vulkan", ok, False, "; ".join(devices), "" if ok else fix)
+
+
+def _sapien_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
+    """Whether SAPIEN itself, where it is installed, finds something to draw with; its physics needs nothing."""
+    if not installed_version("sapien"):
+        return []
+    ok, text = run_probe(_SAPIEN_PROBE)
+    fix = "" if ok else "a Vulkan driver, see the row above; SIMPLER without pictures works as it is"
+    return [Check("SAPIEN pictures", ok, False, text.splitlines()[-1] if text else "", fix)]
 
 
 def _mesa_too_old(device: str) -> bool:

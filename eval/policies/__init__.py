@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,6 +19,7 @@ from vecenv.contract import BatchEnv, Control, ResetInfo
 BUILTIN = {
     "pick_place": "eval.policies.pick_place:PickPlacePolicy",
     "random": "eval.policies.random:RandomPolicy",
+    "voxposer": "eval.policies.voxposer:VoxPoserPolicy",
     "zero": "eval.policies.scripted:ZeroPolicy",
 }
 
@@ -48,6 +50,20 @@ class Policy(Protocol):
             a policy that stepped the environment itself (say with ``step_ee_pose``), the ``Control`` it got.
         """
         ...
+
+
+@runtime_checkable
+class Reporting(Protocol):
+    """A policy that has something to say about each episode beyond the verdict; optional."""
+
+    def extras(self, slot: int) -> Mapping[str, Any]:
+        """Numbers and words about the episode in a slot, which has just finished; they go into its record."""
+        ...
+
+
+def extras_of(policy: Policy, slot: int) -> dict[str, Any]:
+    """What a policy reports about the episode in a slot; nothing if it reports nothing."""
+    return dict(policy.extras(slot)) if isinstance(policy, Reporting) else {}
 
 
 def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:

@@ -1,10 +1,11 @@
 """``pick_place``: a policy with ground truth that solves LIBERO tasks by picking things up and putting them down.
 
 It sees the environment through its public verbs only. Planning happens slot by slot from ``observe_objects``: which
-goal predicate is next (``pick_place_goals``), how to hold the object (``grasp``), how to get it where it belongs
-(``pick_place_transfer``), how to work drawers and knobs (``pick_place_fixtures``). Moving happens for the whole batch
-at once from ``observe_egocentric().state`` (``pick_place_motion``). After a lift the object must have come along; if it
-has not, another grasp is tried, a few times. What the policy cannot do it leaves alone, and says so in ``unsupported``.
+goal predicate is next (``pick_place_goals``), how to hold the object and where to put it (``voxposer.placing``), how to
+get it there (``pick_place_transfer``), how to work drawers and knobs (``pick_place_fixtures``). Moving happens for the
+whole batch at once from ``observe_egocentric().state`` (``pick_place_motion``). After a lift the object must have come
+along; if it has not, another grasp is tried, a few times. What the policy cannot do it leaves alone, and says so in
+``unsupported``.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from eval.policies import pick_place_transfer as transfer
 from eval.policies.pick_place_fixtures import DrawerHandle
 from eval.policies.pick_place_goals import Predicate
 from eval.policies.pick_place_motion import MotionConfig, WaypointFollower
-from eval.policies.pick_place_transfer import Grasped, TransferConfig, World
 from vecenv.contract import BatchEnv, ObjectsSnapshot, ResetInfo
+from voxposer.placing import Grasped, choose_grasp
+from voxposer.world import Margins, World
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +42,7 @@ class PickPlaceConfig:
         followed: an object counts as held when it has risen at least this share of what the hand has risen.
     """
 
-    transfer: TransferConfig = field(default_factory=TransferConfig)
+    transfer: Margins = field(default_factory=Margins)
     motion: MotionConfig = field(default_factory=MotionConfig)
     handle: DrawerHandle = field(default_factory=DrawerHandle)
     knob_turn: float = 1.0
@@ -203,7 +205,7 @@ class PickPlacePolicy:
         if isinstance(target, str):
             slot.done = target
             return
-        grasp = transfer.choose_grasp(world, name, slot.failed.get(name, ()))
+        grasp = choose_grasp(world, name, slot.failed.get(name, ()))
         if grasp is None:
             slot.done = f"{name} offers nothing to hold"
             return

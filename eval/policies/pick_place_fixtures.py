@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from eval.policies.pick_place_motion import CLOSE, OPEN, Waypoint
-from eval.policies.pick_place_transfer import HOME_ROTATION, World, down_facing, spun, yaw
 from vecenv.contract import RegionBox
+from voxposer.world import HOME_ROTATION, World, down_facing, spun, yaw
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eval.policies.pick_place_transfer import Target, World
 from vecenv.contract import ObjectsSnapshot, RegionBox
+from voxposer.placing import Target
+from voxposer.world import World
 
 Predicate = tuple[str, ...]
 

@@ -26,6 +26,8 @@ from vecenv.contract import (
     Metrics,
     Objects,
     ObjectsSnapshot,
+    Part,
+    PartJoint,
     PlanControl,
     PointCloud,
     RegionBox,
@@ -39,6 +41,7 @@ from vecenv.libero import settled as settled_starts
 from vecenv.libero.bddl import Problem, SceneKey
 from vecenv.libero.export import exported_tasks
 from vecenv.libero.geometry import PROFILES
+from vecenv.libero.parts import PartSpec, opening, scene_parts
 from vecenv.libero.scene import Scene
 from vecenv.libero.sources import Task, installed_tasks
 from vecenv.libero.suites import NUM_EPISODES
@@ -46,6 +49,8 @@ from vecenv.physics import budgets
 from vecenv.physics.base import Followed, Group, Physics, Ran, Start, Watcher
 from vecenv.physics.budgets import Budget
 from vecenv.physics.build import BACKENDS, make_physics
+from vecenv.render.eyes import Eyes, options_of
+from vecenv.render.options import RenderConfig, VisualOptions
 
 # What LIBERO evaluations send while objects settle after a reset: no motion, gripper open.
 SETTLE_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
@@ -77,6 +82,7 @@ class LiberoConfig:
         seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode.
         num_threads: threads of the native backend; None for one a core.
         num_devices: GPUs (or other devices) that MJX spreads the slots over.
+        render: size of camera images, level of detail, cameras of one's own.
         waypoint: tolerances and speeds of ``step_ee_pose``.
     """
 
@@ -90,6 +96,7 @@ class LiberoConfig:
     seed: int = 0
     num_threads: int | None = None
     num_devices: int = 1
+    render: RenderConfig = field(default_factory=RenderConfig)
     waypoint: waypoint.WaypointConfig = field(default_factory=waypoint.WaypointConfig)
 
     def __post_init__(self) -> None:
@@ -151,6 +158,7 @@ class LiberoEnv:
         self._closed = False
         self._physics: Physics | None = None
         self._watchers: list[Watcher] = []
+        self._eyes = Eyes(config.render, self.num_envs)
         self._place(placement)
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
@@ -324,8 +332,9 @@ class LiberoEnv:
         return states[:, 1 : 1 + nq], states[:, 1 + nq :]
 
     def close(self) -> None:
-        """Release the physics; the environment cannot be used afterwards. Closing twice is harmless."""
+        """Release physics and renderer; the environment cannot be used afterwards. Closing twice is harmless."""
         self._close_physics()
+        self._eyes.close()
         self._closed = True
 
     def _close_physics(self) -> None:
@@ -477,11 +486,36 @@ class LiberoEnv:
     # -- perception ----------------------------------------------------------------------------------------------------
 
     def observe_egocentric(self) -> Egocentric:
-        """Proprioception of every slot. There is no renderer yet: asking the result for an image says so."""
+        """Proprioception of every slot, and what its cameras see now; images are rendered when they are read.
+
+        Reading one raises ``GlError`` where there is no GL, and ``SceneError`` or ``AssetsMissing`` where the meshes
+        and textures are missing.
+        """
         self._check_live()
         physics = self.physics
         state = np.concatenate([physics.eef_pos, axis_angle(physics.eef_quat), physics.fingers], axis=1)
-        return Egocentric(state=state.astype(np.float32))
+        problems = [self._tasks[int(self._placement.task[group.slots[0]])].problem for group in physics.groups]
+        seen = self._eyes.look(physics.groups, problems)
+        return Egocentric(
+            state=state.astype(np.float32),
+            images=seen.images,
+            depths=seen.depths,
+            segmentations=seen.segmentations,
+            views=seen.views,
+            instances=seen.instances,
+        )
+
+    def set_visuals(self, options: VisualOptions | Sequence[VisualOptions]) -> None:
+        """Change how slots look from now on: light, viewpoints, colours, textures. Physics does not notice.
+
+        Args:
+            options: one for all slots, or B of them; ``VisualOptions()`` is upstream's look.
+
+        Raises:
+            RenderError: not as many as slots. A name that a scene does not have is found when an image is read.
+        """
+        self._check_open()
+        self._eyes.options = options_of(options, self.num_envs)
 
     def observe_objects(self, points: str = "surface") -> Objects:
         """Ground truth of every slot.
@@ -500,16 +534,22 @@ class LiberoEnv:
         errors = list(self._fault)
         for group in self.physics.groups:
             group.refresh_kinematics()
-            clouds = _Clouds.of(group.scene).world(group, points)
+            samples = _Clouds.of(group.scene)
+            clouds, parts = samples.world(group, points), samples.parts_in_world(group)
             for row, slot in enumerate(group.slots):
                 if not errors[slot]:
-                    snapshots[slot] = self._snapshot(group, row, int(slot), clouds)
+                    snapshots[slot] = self._snapshot(group, row, int(slot), clouds, parts[row])
         return Objects(
             snapshot=tuple(snapshots), error=tuple(f"physics failed: {reason}" if reason else "" for reason in errors)
         )
 
     def _snapshot(
-        self, group: Group, row: int, slot: int, clouds: Mapping[str, tuple[np.ndarray, np.ndarray]]
+        self,
+        group: Group,
+        row: int,
+        slot: int,
+        clouds: Mapping[str, tuple[np.ndarray, np.ndarray]],
+        parts: Mapping[str, Part],
     ) -> ObjectsSnapshot:
         scene, problem = group.scene, self._tasks[int(self._placement.task[slot])].problem
         named = {name: PointCloud(pos[row], normal[row]) for name, (pos, normal) in clouds.items()}
@@ -530,6 +570,7 @@ class LiberoEnv:
             workspace=scene.workspace_bounds,
             targets=problem.obj_of_interest,
             movable=tuple(entity.name for entity in scene.objects),
+            parts=parts,
         )
 
     def evaluate(self) -> Metrics:
@@ -654,6 +695,7 @@ class _Clouds:
 
     surface: Mapping[str, surface.BodyPoints]
     corners: Mapping[str, surface.BodyPoints]
+    parts: Mapping[str, PartSpec]
 
     @staticmethod
     @functools.lru_cache(maxsize=64)
@@ -661,7 +703,8 @@ class _Clouds:
         names = tuple(scene.value.entities)
         points = {name: surface.entity_points(scene.value, name) for name in names}
         points[_SCENERY] = surface.scenery_points(scene.value)
-        return _Clouds(points, {name: surface.entity_corners(scene.value, name) for name in names})
+        corners = {name: surface.entity_corners(scene.value, name) for name in names}
+        return _Clouds(points, corners, scene_parts(scene.value))
 
     @staticmethod
     def of(scene: Scene) -> _Clouds:
@@ -674,6 +717,14 @@ class _Clouds:
                 pos, _ = corners.world(group.xpos, group.xmat)
                 clouds[name] = surface.box_samples(pos.min(axis=1), pos.max(axis=1))
         return clouds
+
+    def parts_in_world(self, group: Group) -> list[dict[str, Part]]:
+        """The parts of each slot of a group."""
+        clouds = {name: spec.points.world(group.xpos, group.xmat) for name, spec in self.parts.items()}
+        return [
+            {name: _part(group, row, self.parts[name], pos[row], normal[row]) for name, (pos, normal) in clouds.items()}
+            for row in range(len(group.slots))
+        ]
 
 
 class _ByIdentity:
@@ -707,6 +758,31 @@ def _region_box(group: Group, row: int, name: str) -> RegionBox:
         half_extents=np.array(region.size),
         parent=region.parent,
         axis=axis,
+    )
+
+
+def _part(group: Group, row: int, spec: PartSpec, pos: np.ndarray, normal: np.ndarray) -> Part:
+    return Part(
+        parent=spec.parent,
+        kind=spec.kind,
+        cloud=PointCloud(pos, normal),
+        box=_region_box(group, row, spec.region) if spec.region else None,
+        joint=_part_joint(group, row, spec.joint) if spec.joint else None,
+    )
+
+
+def _part_joint(group: Group, row: int, name: str) -> PartJoint:
+    model = group.scene.model
+    joint = model.joint(name)
+    end = opening(model, name)
+    body = int(joint.bodyid[0])
+    mat = group.xmat[row, body].reshape(3, 3)
+    return PartJoint(
+        kind="slide" if joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE else "hinge",
+        axis=mat @ joint.axis * np.sign(end),
+        anchor=group.xpos[row, body] + mat @ joint.pos,
+        travel=abs(end),
+        opened=float(group.qpos[row, joint.qposadr[0]] * np.sign(end)),
     )
 
 

@@ -430,18 +430,18 @@ def _joint_step(system: System, world: World, action: jax.Array, limits: jax.Arr
     model = system.model.replace(body_pos=world.body_pos, body_quat=world.body_quat)
     goal = joint_control.set_goal(world.data.qpos[:7], action[:7], limits.astype(action.dtype))
 
-    def substep(carry: tuple[mjx.Data, jax.Array, jax.Array], _: None) -> tuple[Any, Any]:
+    def advance(carry: tuple[mjx.Data, jax.Array, jax.Array], _: None) -> tuple[Any, Any]:
         data, fingers, fault = carry
         robot = data.qpos[:_ROBOT]
         arm = kinematics.arm_state(system.chain, robot, data.qvel[:_ROBOT])
         seen = (*kinematics.hand_pose(system.chain, robot), robot[7:])
         fingers = gripper_control.integrate(fingers, action[7])
         ctrl = jnp.concatenate([joint_control.torques(arm, goal), gripper_control.command(fingers)])
-        data = mjx.step(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
+        data = mjx_physics.substep(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
         return (data, fingers, fault | mjx_physics._overflow(data)), seen
 
     carry = (world.data, world.gripper, jnp.zeros((), jnp.int32))
-    (data, fingers, fault), (pos, quat, finger_pos) = lax.scan(substep, carry, None, SUBSTEPS)
+    (data, fingers, fault), (pos, quat, finger_pos) = lax.scan(advance, carry, None, SUBSTEPS)
     fault = fault | jnp.where(mjx_physics._stable(data), 0, mjx_physics._UNSTABLE)
     return world._replace(
         data=data,
@@ -492,8 +492,7 @@ class LiberoEnv:
         sharing = _sharing(sources, problem)
         self.scene = _with_cone(_scene(source, sharing, self.config.geometry), CONES[self.config.cone])
         budget = self.config.budget or _measured(self.scene, sharing)
-        usual = mjx_physics.LEAN_ITERATIONS if self.config.geometry == "lean" else mjx_physics.ITERATIONS
-        iterations = self.config.iterations or usual
+        iterations = self.config.iterations or mjx_physics.usual_iterations(self.config.impl, self.config.geometry)
         built = mjx_physics.build(self.scene, impl=self.config.impl, budget=budget, iterations=iterations)
         self.impl, self.budget = built.impl, budget
         self._physics = _Physics(built, self.config.action)

@@ -53,9 +53,13 @@ class BodyPoints:
 
 def entity_points(scene: Scene, name: str) -> BodyPoints:
     """Samples of one object's or fixture's surface; at least ``MIN_POINTS``."""
-    model = scene.model
-    geoms = [g for g in _subtree_geoms(model, scene.entities[name].root_body) if _collides(model, g)]
-    return sample_geoms(model, geoms, POINTS_PER_ENTITY)
+    geoms = colliding_geoms(scene.model, scene.entities[name].root_body)
+    return sample_geoms(scene.model, geoms, POINTS_PER_ENTITY)
+
+
+def colliding_geoms(model: mujoco.MjModel, body: str) -> list[int]:
+    """Geoms that collide, of a body and all that hangs from it."""
+    return [g for g in _subtree_geoms(model, body) if _collides(model, g)]
 
 
 def scenery_points(scene: Scene, half_size: float = 1.0) -> BodyPoints:
@@ -70,7 +74,7 @@ def scenery_points(scene: Scene, half_size: float = 1.0) -> BodyPoints:
 def entity_corners(scene: Scene, name: str) -> BodyPoints:
     """Corners of the boxes around each geom of an entity, which bound it exactly where the geoms are boxes."""
     model = scene.model
-    geoms = [g for g in _subtree_geoms(model, scene.entities[name].root_body) if _collides(model, g)]
+    geoms = colliding_geoms(model, scene.entities[name].root_body)
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     local = [model.geom_aabb[g, :3] + signs * model.geom_aabb[g, 3:] for g in geoms]
     pos = [points @ _mat(model.geom_quat[g]).T + model.geom_pos[g] for g, points in zip(geoms, local, strict=True)]

@@ -75,6 +75,11 @@ class Group(Protocol):
         ...
 
     @property
+    def seen_qpos(self) -> np.ndarray:
+        """Positions as camera images show them, [n, nq]."""
+        ...
+
+    @property
     def qvel(self) -> np.ndarray:
         """Velocities, [n, nv]."""
         ...
@@ -112,6 +117,10 @@ class Group(Protocol):
     @property
     def touch(self) -> np.ndarray:
         """Contact sensors as of the last full step, [n, nsensordata]."""
+        ...
+
+    def expand(self, field: str) -> np.ndarray:
+        """``body_pos`` or ``body_quat`` of every slot, a copy, [n, nbody, ...]."""
         ...
 
     def refresh_kinematics(self) -> None:

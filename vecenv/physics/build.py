@@ -42,7 +42,7 @@ def make_physics(
         from vecenv.physics.native import NativePhysics
 
         return NativePhysics(scenes, scene_of_slot, num_threads)
-    from vecenv.physics.mjx import ITERATIONS, LEAN_ITERATIONS, MjxPhysics, build
+    from vecenv.physics.mjx import MjxPhysics, build, usual_iterations
 
     if backend not in BACKENDS:
         raise ValueError(f"backend={backend!r}: expected one of {', '.join(BACKENDS)}")
@@ -51,6 +51,5 @@ def make_physics(
     for scene, budget in zip(scenes, budgets, strict=True):
         if budget is None:
             raise ValueError(f"backend {backend!r} needs a budget for each scene")
-        effort = LEAN_ITERATIONS if geometry == "lean" else ITERATIONS
-        builds.append(build(scene, impl=impl, budget=budget, iterations=effort))
+        builds.append(build(scene, impl=impl, budget=budget, iterations=usual_iterations(impl, geometry)))
     return MjxPhysics(builds, scene_of_slot, num_devices)

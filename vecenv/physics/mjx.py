@@ -30,7 +30,7 @@ from vecenv.controllers import kinematics, osc, waypoint
 from vecenv.controllers.rotations import quat_to_mat
 from vecenv.libero import cache, goals
 from vecenv.libero.scene import HOME_QPOS, Scene
-from vecenv.physics import budgets
+from vecenv.physics import budgets, newton
 from vecenv.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Followed, Physics, Ran, Start, Watcher
 from vecenv.physics.spread import Spread, replicated
 
@@ -181,13 +181,19 @@ class Build:
         return mjx.make_data(self.model, impl=self.impl, **sizes)
 
 
-# Newton iterations and line-search steps of a substep at most, by geometry profile; upstream's are 100 and 50. A batch
-# waits for its slowest world, and 99 in 100 worlds are done after two or three iterations.
-ITERATIONS, LEAN_ITERATIONS = (10, 20), (4, 8)
+def usual_iterations(impl: str | None, geometry: str) -> tuple[int, int]:
+    """Newton iterations and line-search steps of a substep at most; upstream's are 100 and 50.
+
+    On warp a batch waits for its slowest world, and 99 in 100 worlds are done after two or three iterations. On jax
+    both end when the batch is done; with 4 and 8, cans that rest roll off by centimetres (libero_object, lean).
+    """
+    if resolve_impl(impl) == "jax":
+        return (20, 20)
+    return (4, 8) if geometry == "lean" else (10, 20)
 
 
 def build(
-    scene: Scene, *, impl: str | None = None, budget: budgets.Budget, iterations: tuple[int, int] = ITERATIONS
+    scene: Scene, *, impl: str | None = None, budget: budgets.Budget, iterations: tuple[int, int] | None = None
 ) -> Build:
     """Put a scene on the device.
 
@@ -195,17 +201,19 @@ def build(
         scene: a compiled scene.
         impl: ``"jax"``, ``"warp"`` or None, see ``resolve_impl``.
         budget: sizes of the contact and constraint memory.
-        iterations: solver iterations and line-search steps at most.
+        iterations: solver iterations and line-search steps at most; None for ``usual_iterations`` of exact geometry.
 
     Raises:
-        MjxError: see ``resolve_impl``; or the arm does not come first.
+        MjxError: see ``resolve_impl``; or the integrator is another; or the arm does not come first.
     """
     chosen = resolve_impl(impl)
     _remember_compilations()
     if [*scene.arm_qpos, *scene.finger_qpos] != list(range(_ROBOT)):
         raise MjxError("the arm and its fingers must be the scene's first joints")
+    if scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
+        raise MjxError("the scene's integrator must be Euler")
     model = budget.limited(scene.model)
-    model.opt.iterations, model.opt.ls_iterations = iterations
+    model.opt.iterations, model.opt.ls_iterations = iterations or usual_iterations(chosen, "exact")
     touching = _without_contact_sensors(model) if chosen == "jax" else None
     put = mjx.put_model(model, impl=chosen)
     if chosen == "warp":
@@ -318,8 +326,11 @@ def _cleared(data: mjx.Data, qpos: jax.Array, qvel: jax.Array, time: jax.Array) 
 
 def forward(system: System, world: World) -> mjx.Data:
     """Kinematics, contacts and contact sensors of the present state."""
+    model = _own_model(system, world)
     with jax.default_matmul_precision("highest"):
-        return _sensed(system, mjx.forward(_own_model(system, world), world.data))
+        if world.data.impl == mjx.Impl.WARP:
+            return mjx.forward(model, world.data)
+        return _sensed(system, mjx.collision(model, mjx.kinematics(model, world.data)))
 
 
 def _placed(system: System, world: World) -> mjx.Data:
@@ -371,7 +382,7 @@ def _control_step(system: System, world: World, action: jax.Array, active: jax.A
     model = _own_model(system, world)
     goal = _new_goal(system, world, action)
 
-    def substep(carry: tuple[mjx.Data, jax.Array, jax.Array], index: jax.Array) -> tuple[Any, Any]:
+    def advance(carry: tuple[mjx.Data, jax.Array, jax.Array], index: jax.Array) -> tuple[Any, Any]:
         data, fingers, fault = carry
         robot, speed = data.qpos[:_ROBOT], data.qvel[:_ROBOT]
         arm = kinematics.arm_state(system.chain, robot, speed)
@@ -380,11 +391,11 @@ def _control_step(system: System, world: World, action: jax.Array, active: jax.A
         torque = osc.torques(seen_by_controller, goal, system.home.qpos)
         fingers = gripper_control.integrate(fingers, action[6])
         ctrl = jnp.concatenate([torque, gripper_control.command(fingers)])
-        data = mjx.step(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
+        data = substep(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
         return (data, fingers, fault | _overflow(data)), seen
 
     carry = (world.data, world.gripper, jnp.zeros((), jnp.int32))
-    (data, fingers, fault), seen = lax.scan(substep, carry, jnp.arange(SUBSTEPS))
+    (data, fingers, fault), seen = lax.scan(advance, carry, jnp.arange(SUBSTEPS))
     data, fault = _sensed(system, data), fault | jnp.where(_stable(data), 0, _UNSTABLE)
     pos, quat, finger_pos = seen
     after = world._replace(
@@ -400,6 +411,18 @@ def _control_step(system: System, world: World, action: jax.Array, active: jax.A
         lambda new, old: jnp.where(active, new, old), after._replace(data=None), world._replace(data=None)
     )
     return small._replace(data=_keep_state(active, data, world.data))
+
+
+def substep(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """``mjx.step`` without sensors; with ``impl="jax"`` the constraints are solved by ``vecenv.physics.newton``."""
+    if data.impl == mjx.Impl.WARP:
+        return mjx.step(model, data)
+    for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration, newton.solve):
+        data = stage(model, data)
+    # jaxlib 0.10 lets threads of XLA's pool wait for parts of a batched Cholesky factorisation that the same pool has
+    # yet to do: when the integrator's, which needs nothing of the solver's, runs beside it on two threads, nobody is
+    # left and the call never ends. So it is told to wait (0 x acceleration is not folded away: it may not be finite).
+    return mjx.euler(model, data.tree_replace({"_impl.M": data._impl.M + 0 * data.qacc[:1]}))
 
 
 _STATE = (
@@ -723,6 +746,11 @@ class MjxGroup:
     @property
     def qpos(self) -> np.ndarray:
         """[n, nq]."""
+        return self._fetch("qpos")
+
+    @property
+    def seen_qpos(self) -> np.ndarray:
+        """[n, nq]: the present ones; upstream's images are two substeps (4 ms) older."""
         return self._fetch("qpos")
 
     @property

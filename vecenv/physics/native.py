@@ -108,10 +108,13 @@ class _Block:
         home: the arm at reset, as ``home_row`` gives it.
         slots: their indices in the batch, int [n].
         observed: written here, [n, ...].
+        seen_qpos: likewise, [n, nq].
     """
 
-    def __init__(self, scene: Scene, home: np.ndarray, slots: np.ndarray, observed: Observed) -> None:
-        self.scene, self.slots, self.observed = scene, slots, observed
+    def __init__(
+        self, scene: Scene, home: np.ndarray, slots: np.ndarray, observed: Observed, seen_qpos: np.ndarray
+    ) -> None:
+        self.scene, self.slots, self.observed, self.seen_qpos = scene, slots, observed, seen_qpos
         self.batch = Batch(scene.model, len(slots), 1, persistent=True)
         bind = self.batch.bind
         self._qpos, self._qvel, self._time = bind("qpos"), bind("qvel"), bind("time")
@@ -192,6 +195,7 @@ class _Block:
         chosen = slice(None) if rows is None else rows
         self.observed.eef_pos[chosen] = self._site_xpos[chosen, self.scene.grip_site]
         self.observed.eef_quat[chosen] = self._xquat[chosen, self.scene.hand_body]
+        self.seen_qpos[chosen] = self._qpos[chosen]
 
     def _observe_fingers(self, rows: _Rows) -> None:
         chosen = slice(None) if rows is None else rows
@@ -213,17 +217,19 @@ class Group:
         xpos, xquat, xmat, site_xpos, site_xmat: kinematics; bodies or sites second.
         touch: contact sensors as of the last full step, [n, nsensordata].
         observed: proprioception.
+        seen_qpos: positions as camera images show them, those of ``observed``'s kinematics, [n, nq].
     """
 
     def __init__(self, scene: Scene, slots: np.ndarray, workers: Workers | None = None, block: int = BLOCK) -> None:
         self.scene, self.slots = scene, slots
         self._workers = workers or Workers(1)
-        self.observed = Observed.zeros(len(slots))
+        self.observed, self.seen_qpos = Observed.zeros(len(slots)), np.zeros((len(slots), scene.model.nq))
         bounds = np.linspace(0, len(slots), -(-len(slots) // block) + 1).astype(int).tolist()
         self._rows = [slice(low, high) for low, high in itertools.pairwise(bounds)]
         home = home_row(scene)
         self.blocks = [
-            _Block(scene, home, slots[rows], Observed(*(array[rows] for array in self.observed))) for rows in self._rows
+            _Block(scene, home, slots[rows], Observed(*(array[rows] for array in self.observed)), self.seen_qpos[rows])
+            for rows in self._rows
         ]
         self._bound: dict[str, np.ndarray] = {}
         self.qpos, self.qvel, self.time = self.bind("qpos"), self.bind("qvel"), self.bind("time")

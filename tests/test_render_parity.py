@@ -1,0 +1,110 @@
+"""Pictures are upstream's: the same state seen through the same cameras by LIBERO's ``OffScreenRenderEnv``.
+
+The peer renders with images switched on, in the GL that vecenv draws with; its observations, turned by 180 degrees as
+VLA evaluations turn them, are compared with what ``observe_egocentric`` delivers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+import upstream
+from pictures import needs_gl, psnr
+
+import vecenv
+from vecenv.contract import Egocentric
+from vecenv.libero.env import LiberoEnv
+
+pytestmark = needs_gl
+
+CAMERAS = {"agentview": "agentview_image", "wrist": "robot0_eye_in_hand_image"}
+# What the project promises; measured is equality to the bit.
+ENOUGH = 45.0
+
+
+def peer_with_images(path: Any) -> Any:
+    control_env, _ = upstream._classes()
+    with upstream.silence():
+        return control_env(
+            str(path), has_offscreen_renderer=True, use_camera_obs=True, camera_heights=256, camera_widths=256
+        )
+
+
+def fixtures_of(peer: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    model = upstream.model_of(peer)
+    bodies = {name: model.body(fixture.root_body) for name, fixture in peer.env.fixtures_dict.items()}
+    return {name: (body.pos.copy(), body.quat.copy()) for name, body in bodies.items()}
+
+
+@contextmanager
+def pair(suite: str, task: int, episode: int) -> Iterator[tuple[Any, dict[str, Any], LiberoEnv]]:
+    """Upstream right after ``set_init_state``, its observation, and ours in the same start."""
+    spec = vecenv.list_tasks(suite)[task]
+    peer = peer_with_images(spec.bddl_path)
+    with upstream.silence():
+        peer.reset()  # which hides what a new environment still shows: the gripper's frames
+    seen = peer.set_init_state(spec.init_states()[episode])
+    env = vecenv.make(suite, task=task, episodes=[episode], fixtures=fixtures_of(peer), start="raw", settle_steps=0)
+    assert isinstance(env, LiberoEnv)
+    env.reset()
+    yield peer, seen, env
+    env.close()
+    peer.close()
+
+
+def agreement(ours: Egocentric, theirs: dict[str, Any]) -> float:
+    """The lower PSNR of the two cameras, dB."""
+    return min(psnr(ours.images[name][0], theirs[key][::-1, ::-1]) for name, key in CAMERAS.items())
+
+
+def random_action(rng: np.random.Generator) -> np.ndarray:
+    return np.append(rng.uniform(-1, 1, 6), rng.choice([-1.0, 1.0]))
+
+
+def test_pictures_of_a_rollout_are_upstreams() -> None:
+    """The start, and frames in motion: upstream samples them within the 24th of 25 substeps."""
+    rng = np.random.default_rng(0)
+    with pair("libero_goal", 7, episode=2) as (peer, seen, env):
+        assert agreement(env.observe_egocentric(), seen) > ENOUGH
+        for _ in range(3):
+            action = random_action(rng)
+            theirs, *_ = peer.step(action)
+            env.step_continuous(action[None])
+            assert agreement(env.observe_egocentric(), theirs) > ENOUGH
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("scene_id", upstream.scene_ids())
+def test_pictures_of_every_scene_are_upstreams(scene_id: str) -> None:
+    """Four states a scene, 128 in all: the start, two in motion, and one with every joint somewhere else."""
+    suite, task = scene_id.rsplit("-", 1)
+    rng = np.random.default_rng(int(task))
+    with pair(suite, int(task), episode=int(task) % 50) as (peer, seen, env):
+        found = [agreement(env.observe_egocentric(), seen)]
+        for _ in range(2):
+            for action in (random_action(rng) for _ in range(3)):
+                theirs, *_ = peer.step(action)
+                env.step_continuous(action[None])
+            found.append(agreement(env.observe_egocentric(), theirs))
+        qpos, qvel = _shuffled(env, rng)
+        theirs = peer.set_init_state(np.concatenate([[0.0], qpos, qvel]))
+        env.set_state(qpos=qpos[None], qvel=qvel[None])
+        found.append(agreement(env.observe_egocentric(), theirs))
+        print(scene_id, [round(value, 1) for value in found])
+        assert min(found) > ENOUGH
+
+
+def _shuffled(env: LiberoEnv, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Hinges and slides anywhere within their limits (stoves on, drawers open), free things a little off."""
+    model, state = env.mj_model, env.state()
+    qpos, limited = state.qpos[0].copy(), model.jnt_limited.astype(bool)
+    addresses = model.jnt_qposadr
+    low, high = model.jnt_range[limited].T
+    qpos[addresses[limited]] = rng.uniform(low, high)
+    for address in addresses[model.jnt_type == 0]:
+        qpos[address : address + 3] += rng.uniform(-0.05, 0.05, 3)
+    return qpos, np.zeros_like(state.qvel[0])

@@ -1,0 +1,175 @@
+"""Pictures of a batch tiled into one, and videos of them: one mp4 for an episode or for sixteen.
+
+In: images [B, H, W, 3] and a title a slot. Out: one image, or a file that any player opens. Writing videos needs
+``imageio[ffmpeg]`` and titles need ``pillow``, both in the extra ``render``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from vecenv.contract import Rendered
+from vecenv.render.options import RenderError
+
+# Height of the line above an image that has a title, pixels; and the darkness between tiles.
+TITLE_HEIGHT, GAP = 16, 2
+# Control ticks a second: a video at this rate runs as fast as the robot.
+CONTROL_HZ = 20
+_BACKGROUND, _INK = (24, 24, 24), (235, 235, 235)
+_SOLVED, _FAILED = (80, 200, 120), (230, 90, 80)
+
+
+def render_grid(
+    images: np.ndarray | Sequence[np.ndarray],
+    titles: Sequence[str] = (),
+    *,
+    columns: int | None = None,
+    verdicts: Sequence[bool | None] = (),
+) -> np.ndarray:
+    """Images side by side, uint8 [H', W', 3]; a notebook shows it with ``PIL.Image.fromarray``.
+
+    Args:
+        images: [B, H, W, 3], or several of that (two cameras, say), which are put next to each other.
+        titles: a line above each; cut off where it is too long.
+        columns: how many stand in a row; by default about as many as there are rows.
+        verdicts: True frames a slot in green, False in red, None not at all.
+
+    Raises:
+        RenderError: not images, or not as many titles or verdicts as images.
+    """
+    tiles = _side_by_side(images)
+    for name, given in (("titles", titles), ("verdicts", verdicts)):
+        if len(given) not in (0, len(tiles)):
+            raise RenderError(f"{len(given)} {name} for {len(tiles)} images")
+    if columns is not None and columns < 1:
+        raise RenderError(f"columns={columns}: need at least 1")
+    framed = [
+        _framed(tile, titles[i] if titles else None, verdicts[i] if verdicts else None) for i, tile in enumerate(tiles)
+    ]
+    columns = min(columns or math.ceil(math.sqrt(len(framed))), len(framed))
+    height, width = framed[0].shape[:2]
+    rows = math.ceil(len(framed) / columns)
+    canvas = np.full((rows * height, columns * width, 3), _BACKGROUND, np.uint8)
+    for index, tile in enumerate(framed):
+        y, x = divmod(index, columns)
+        canvas[y * height : (y + 1) * height, x * width : (x + 1) * width] = tile
+    return canvas
+
+
+def _side_by_side(images: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
+    sets = [images] if isinstance(images, np.ndarray) else list(images)
+    if not sets or any(
+        s.ndim != 4 or s.shape[-1] != 3 or s.dtype != np.uint8 or s.shape != sets[0].shape for s in sets
+    ):
+        raise RenderError("images must be uint8 [B, H, W, 3], all of one shape")
+    if not len(sets[0]):
+        raise RenderError("there is no image to show")
+    return np.concatenate(sets, axis=2)
+
+
+def _framed(tile: np.ndarray, title: str | None, verdict: bool | None) -> np.ndarray:
+    head = 0 if title is None else TITLE_HEIGHT
+    color = _BACKGROUND if verdict is None else _SOLVED if verdict else _FAILED
+    height, width = tile.shape[0] + head + 2 * GAP, tile.shape[1] + 2 * GAP
+    framed = np.full((height, width, 3), color, np.uint8)
+    framed[GAP + head : -GAP, GAP:-GAP] = tile
+    if title is not None:
+        framed[GAP : GAP + head, GAP:-GAP] = _title(title, tile.shape[1])
+    return framed
+
+
+def _title(text: str, width: int) -> np.ndarray:
+    """One line of text, uint8 [TITLE_HEIGHT, width, 3]."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    line = Image.new("RGB", (width, TITLE_HEIGHT), _BACKGROUND)
+    ImageDraw.Draw(line).text((3, 2), text, fill=_INK, font=ImageFont.load_default(size=11))
+    return np.asarray(line)
+
+
+class VideoWriter:
+    """Writes frames to an mp4; a context manager. Frames may have any size, all the same.
+
+    Args:
+        path: the file, ending in .mp4.
+        fps: frames a second.
+
+    Raises:
+        RenderError: another ending, or imageio[ffmpeg] is not installed.
+    """
+
+    def __init__(self, path: str | Path, fps: float = CONTROL_HZ) -> None:
+        self.path = Path(path)
+        if self.path.suffix != ".mp4":
+            raise RenderError(f"{self.path}: videos are written as .mp4")
+        self.frames = 0
+        self._fps, self._writer = fps, None
+
+    def add(self, frame: np.ndarray) -> None:
+        """Append a frame, uint8 [H, W, 3]."""
+        if self._writer is None:
+            self._writer = _open(self.path, self._fps)
+        # H.264 stores colour for two pixels at a time: both sides must be even.
+        padded = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
+        self._writer.append_data(padded)
+        self.frames += 1
+
+    def close(self) -> None:
+        """Finish the file. Closing twice is harmless."""
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = None
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def _open(path: Path, fps: float) -> Any:
+    try:
+        import imageio
+        import imageio_ffmpeg  # noqa: F401 - imageio finds ffmpeg through it
+    except ImportError as error:
+        raise RenderError("writing videos needs imageio and ffmpeg: pip install 'vecenv[render]'") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return imageio.get_writer(path, fps=fps, codec="libx264", quality=8, macro_block_size=1)
+
+
+@contextmanager
+def recording(
+    env: Any, path: str | Path, *, cameras: Sequence[str] = ("agentview",), columns: int | None = None
+) -> Iterator[VideoWriter]:
+    """While inside, write what the cameras see at every control tick: all slots in one video, titled.
+
+    Whatever verb moves the slots, every tick becomes a frame. A slot is framed in green once it is solved; in the last
+    frame, which shows how things ended, those that are not are framed in red.
+
+    Args:
+        env: a live LIBERO environment (``reset`` has been called; it is asked for the titles).
+        path: the mp4.
+        cameras: shown side by side.
+        columns: slots in a row.
+    """
+    info = env.reset()
+    titles = [f"{name}: {text}" for name, text in zip(info.episode_id, info.instruction, strict=True)]
+
+    def shoot(failed: bool | None = None) -> None:
+        seen, solved = env.observe_egocentric(), env.evaluate().success
+        if isinstance(seen.images, Rendered):
+            seen.images.prepare(*cameras)
+        verdicts = [True if one else failed for one in solved.tolist()]
+        video.add(render_grid([seen.images[name] for name in cameras], titles, columns=columns, verdicts=verdicts))
+
+    with VideoWriter(path) as video:
+        with env.watched(lambda actions, active: shoot()):
+            yield video
+        shoot(failed=False)

@@ -1,0 +1,238 @@
+"""Things that shall move themselves: model-predictive pushes along a planned path, one for each look.
+
+A :class:`Pushing` (what is pushed, and the way it shall go) and fresh sights of it come in; the stops of one push each
+go out, for all slots that push, in one call of the search. The loop is upstream's (``interfaces.py``, ``execute``): it
+ends when the thing is within a centimetre of the end of its way, and places of the way that lie behind it are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+
+from voxposer.perception import Perception
+from voxposer.push import Push, PushConfig, best_push, push_waypoints
+from voxposer.route import Stop
+
+# Pushes searched for at once: one shape, one compilation.
+CHUNK = 8
+
+
+class PushError(RuntimeError):
+    """A thing cannot be pushed where it should go."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushingConfig:
+    """How things are pushed. Metres unless noted.
+
+    Attributes:
+        push: of the search, and of the motion where there is ample room.
+        starts: how far before the contact a push may start, and the slant of the fingers, radians, best first. Where
+            what is behind leaves no room, the hand leans over the thing and its fingers reach behind it.
+        near: a thing this close to the end of its way has arrived.
+        most: pushes for one way at most.
+        over_ground: the grip site stays this far above the table.
+        reach: horizontally from the robot's base, of a hand that points down.
+        slanted_reach: less reach of a hand whose fingers lie level.
+        facing: cosine between a face and the push against it, at least.
+        room: that the hand needs around it where a push starts.
+        body: the closed hand in its own frame (x, y across the fingers, z out of them), lower and upper corners of the
+            fingers, the palm, and the wrist, which reaches to either side.
+    """
+
+    push: PushConfig = field(default_factory=lambda: PushConfig(push_speed=0.5, retreat_speed=1.0))
+    starts: tuple[tuple[float, float], ...] = (
+        (0.08, np.pi / 4),
+        (0.05, np.pi / 4),
+        (0.08, 0.0),
+        (0.05, 0.0),
+        (0.05, -0.5),
+        (0.03, -0.5),
+        (0.02, -0.5),
+        (0.03, -0.8),
+    )
+    near: float = 0.01
+    most: int = 12
+    over_ground: float = 0.02
+    reach: float = 0.80
+    slanted_reach: float = 0.12
+    facing: float = 0.3
+    room: float = 0.004
+    body: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = (
+        ((-0.0105, -0.027, -0.031), (0.0105, 0.027, 0.0095)),
+        ((-0.032, -0.104, -0.14), (0.032, 0.104, -0.031)),
+        ((-0.100, -0.060, -0.28), (0.100, 0.060, -0.14)),
+    )
+
+
+@dataclass
+class Pushing:
+    """A thing on its way.
+
+    Attributes:
+        name: of the thing.
+        way: places for its centre, world frame, [P, 3]; the last is where it shall be.
+        cursor: the next of them.
+        pushes: how many there were.
+    """
+
+    name: str
+    way: np.ndarray
+    cursor: int = 0
+    pushes: int = 0
+
+
+def arrived(pushing: Pushing, perception: Perception, config: PushingConfig = PushingConfig()) -> bool:
+    """Whether the thing is where it shall be, or has been pushed often enough; places behind it are passed over."""
+    centre = perception.snapshot.objects[pushing.name].points.mean(axis=0)
+    left = (pushing.way[-1] - centre)[:2]
+    if np.linalg.norm(left) <= config.near or pushing.pushes >= config.most:
+        return True
+    last = len(pushing.way) - 1
+    while pushing.cursor < last and left @ (pushing.way[pushing.cursor] - centre)[:2] <= config.near**2:
+        pushing.cursor += 1
+    return False
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What is known before a push is searched for.
+
+    Attributes:
+        pushing: what is pushed where.
+        perception: the present snapshot.
+        lowest: height below which the grip site must not go, metres.
+        free: points that the hand has room to push at, bool [M].
+    """
+
+    pushing: Pushing
+    perception: Perception
+    lowest: float
+    free: np.ndarray
+
+
+def sight(pushing: Pushing, perception: Perception, config: PushingConfig) -> Sight:
+    """Where a thing can be pushed: towards the next place of its way, or else towards the first later one with room.
+
+    The cursor moves along to that place.
+
+    Raises:
+        PushError: the hand has no room to begin any push.
+    """
+    centre = perception.snapshot.objects[pushing.name].points.mean(axis=0)
+    lowest = perception.world.ground(centre[:2]) + config.over_ground
+    for cursor in range(pushing.cursor, len(pushing.way)):
+        free = _touchable(pushing, perception, pushing.way[cursor], lowest, config)
+        if free.any():
+            pushing.cursor = cursor
+            return Sight(pushing, perception, lowest, free)
+    raise PushError(f"the hand has no room to begin a push of {pushing.name}")
+
+
+def next_pushes(sights: Sequence[Sight], config: PushingConfig) -> list[list[Stop]]:
+    """The stops of the best push for each slot: over the start, start, end, back, up."""
+    found: list[list[Stop]] = []
+    for first in range(0, len(sights), CHUNK):
+        found += _searched(sights[first : first + CHUNK], config)
+    return found
+
+
+def _searched(sights: Sequence[Sight], config: PushingConfig) -> list[list[Stop]]:
+    clouds = [sight.perception.snapshot.objects[sight.pushing.name] for sight in sights]
+    most = max(len(cloud.points) for cloud in clouds)
+
+    def stacked(rows: Sequence[np.ndarray]) -> np.ndarray:
+        filled = [np.concatenate([row, np.repeat(row[-1:], most - len(row), axis=0)]) for row in rows]
+        return _padded(np.stack(filled), CHUNK - len(sights))
+
+    push = best_push(
+        stacked([cloud.points for cloud in clouds]),
+        _padded(np.stack([s.pushing.way[s.pushing.cursor] for s in sights]), CHUNK - len(sights)),
+        jax.vmap(jax.random.key)(_padded(np.array([s.pushing.pushes for s in sights]), CHUNK - len(sights))),
+        config.push,
+        valid=_padded(np.stack([np.arange(most) < len(cloud.points) for cloud in clouds]), CHUNK - len(sights)),
+        normals=stacked([cloud.normals for cloud in clouds]),
+        touchable=stacked([s.free for s in sights]),
+        lowest=_padded(np.array([s.lowest for s in sights]), CHUNK - len(sights)),
+    )
+    for s in sights:
+        s.pushing.pushes += 1
+        s.pushing.cursor = min(s.pushing.cursor + 1, len(s.pushing.way) - 1)
+    return [_way(i, push, s.perception, s.lowest, config) for i, s in enumerate(sights)]
+
+
+def _way(slot: int, push: Push, perception: Perception, lowest: float, config: PushingConfig) -> list[Stop]:
+    """The stops of a slot's push, from the first of the starts that has room."""
+    contact, ahead = np.asarray(push.contact[slot], float), np.asarray(push.direction[slot], float)
+    ground = float(lowest)
+    fitting = [s for s in config.starts if _fits(perception, contact[None], ahead[None], ground, *s, config)[0]]
+    distance, slant = (fitting or config.starts)[0]
+    chosen = replace(config.push, start_distance=distance, slant=slant)
+    one = Push(*(value[slot : slot + 1] for value in push))
+    way = push_waypoints(one, chosen, hand=perception.snapshot.ee_pose[3:])
+    return _stops(np.asarray(way.pose[0]), np.asarray(way.velocity[0]))
+
+
+def _touchable(
+    pushing: Pushing, perception: Perception, target: np.ndarray, lowest: float, config: PushingConfig
+) -> np.ndarray:
+    """Points of a thing whose face looks against a push from there to a target that has room to start, bool [M]."""
+    cloud = perception.snapshot.objects[pushing.name]
+    ahead = (target - cloud.points) * [1.0, 1.0, 0.0]
+    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
+    met = cloud.points - _reach_back(cloud.points, ahead, lowest, config)[:, None] * ahead
+    room = [_fits(perception, met, ahead, lowest, *start, config) for start in config.starts]
+    return np.any(room, axis=0) & ((cloud.normals * ahead).sum(axis=1) < -config.facing)
+
+
+def _reach_back(points: np.ndarray, ahead: np.ndarray, lowest: float, config: PushingConfig) -> np.ndarray:
+    """How far behind each point the thing is met first by a hand that comes from behind, metres [M]."""
+    touched = np.maximum(points, [-np.inf, -np.inf, lowest])
+    offset = points[None] - touched[:, None]
+    back = -np.einsum("ijk,ik->ij", offset, ahead)
+    aside = np.linalg.norm((offset + back[..., None] * ahead[:, None])[..., :2], axis=2)
+    met = (aside <= config.push.hand_width / 2) & (offset[..., 2] > -config.push.tip)
+    return np.where(met & (back < config.push.start_distance), back, 0.0).max(axis=1)
+
+
+def _fits(
+    perception: Perception,
+    contacts: np.ndarray,
+    ahead: np.ndarray,
+    lowest: float,
+    distance: float,
+    slant: float,
+    config: PushingConfig,
+) -> np.ndarray:
+    """Whether the hand has room where pushes of ``contacts`` [M, 3] along ``ahead`` [M, 3] start, bool [M]."""
+    start = contacts - distance * ahead
+    start[:, 2] = np.maximum(start[:, 2], lowest)
+    obstacles = perception.world.others()
+    obstacles = obstacles[np.linalg.norm((obstacles - contacts.mean(axis=0))[:, :2], axis=1) < 0.4]
+    obstacles = obstacles[obstacles[:, 2] > lowest - config.over_ground + 0.005]
+    up = np.array([0.0, 0.0, 1.0])
+    out = np.sin(slant) * ahead - np.cos(slant) * up
+    left = np.cross(up, ahead)
+    hands = np.stack([np.cross(left, out), left, out], axis=2)
+    local = np.einsum("nmk,nkj->nmj", obstacles[None] - start[:, None], hands)
+    hit = np.zeros(local.shape[:2], bool)
+    for low, high in config.body:
+        hit |= ((local > np.array(low) - config.room) & (local < np.array(high) + config.room)).all(axis=2)
+    reach = config.reach - config.slanted_reach * max(np.sin(slant), 0.0)
+    near = np.linalg.norm((start - perception.base)[:, :2], axis=1) < reach
+    return ~np.asarray(hit.any(axis=1)) & near
+
+
+def _stops(poses: np.ndarray, velocity: np.ndarray) -> list[Stop]:
+    return [
+        Stop(pose[:3].astype(float), pose[3:].astype(float), True, float(v))
+        for pose, v in zip(poses, velocity, strict=True)
+    ]
+
+
+def _padded(rows: np.ndarray, count: int) -> np.ndarray:
+    return np.concatenate([rows, np.repeat(rows[-1:], count, axis=0)])
