@@ -1,0 +1,719 @@
+"""The SIMPLER environment: layouts, scenes, controllers and success criteria behind the verbs of ``vecenv.contract``.
+
+A batch of slots, each with one episode of one task of ``simpler/bridge`` (WidowX, 5 Hz) or ``simpler/google_robot``
+(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``robots.py`` for what becomes of an action,
+``scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so actions of the whole
+batch become set-points in one call; scenes are stepped one by one, spread over worker processes.
+
+An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in the axes of the robot's base. It is
+clipped to 1 m, pi/2 rad and 1. The gripper's convention is the robot's own: WidowX takes +1 as open and -1 as closed,
+absolute; the Google Robot adds, +1 closes further, -1 opens further, 0 stays.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vecenv import actions as action_space
+from vecenv import placement as placing
+from vecenv.contract import (
+    CameraView,
+    Control,
+    EePoseControl,
+    Egocentric,
+    Metrics,
+    Objects,
+    PlanControl,
+    Rendered,
+    ResetInfo,
+    State,
+)
+from vecenv.simpler import assets, kinematics, robots
+from vecenv.simpler.episodes import Episode, prepare
+from vecenv.simpler.judge import Judge, Verdict
+from vecenv.simpler.kinematics import rotation_from_quat
+from vecenv.simpler.layouts import episode_layout, episode_seed
+from vecenv.simpler.scenes import instances
+from vecenv.simpler.servo import Servo, ServoConfig
+from vecenv.simpler.tasks import NUM_EPISODES, SimplerTask, find_task, list_tasks
+from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
+
+if TYPE_CHECKING:
+    from vecenv.simpler.overlay import Painter, Picture
+
+BACKENDS = ("physx_cpu",)
+GRIPPERS = ("native", "binary")
+OVERLAYS = ("background", "none", "blend")
+# Largest action: metres, radians, gripper.
+ACTION_LIMITS = np.array([1.0, 1.0, 1.0, np.pi / 2, np.pi / 2, np.pi / 2, 1.0])
+# LIBERO's name for the third-person camera.
+_CAMERA = "agentview"
+# More objects than any task has.
+_MAX_OBJECTS = 8
+
+Watcher = Callable[[np.ndarray, np.ndarray], None]
+
+
+class SimplerError(ValueError):
+    """An option or call that this environment cannot honour; the message says what would be right."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimplerConfig:
+    """Options of a SIMPLER batch.
+
+    Attributes:
+        backend: ``"physx_cpu"``.
+        num_workers: processes that scenes are spread over; 1 steps them in this one. None: one a core, and no more
+            than slots.
+        gripper: ``"native"``, the robot's own convention; or ``"binary"``, 1 closed and 0 open (above or below one
+            half).
+        max_steps: step budget in control ticks; None for each task's own.
+        servo: speeds and tolerances of ``step_ee_pose``; None for the suite's own.
+        overlay: what replaces the background of pictures: ``"background"``, a photograph, as upstream's visual matching
+            does; ``"none"``; or ``"blend"``, both at one half.
+        shadows: whether lights cast shadows; upstream's do not.
+        assets: root of the asset tree; None for where ``vecenv assets pull simpler`` puts it.
+    """
+
+    backend: str = "physx_cpu"
+    num_workers: int | None = None
+    gripper: str = "native"
+    max_steps: int | None = None
+    servo: ServoConfig | None = None
+    overlay: str = "background"
+    shadows: bool = False
+    assets: Path | None = None
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("backend", BACKENDS), ("gripper", GRIPPERS), ("overlay", OVERLAYS)):
+            if getattr(self, name) not in allowed:
+                raise SimplerError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
+        for name in ("num_workers", "max_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise SimplerError(f"{name}={value}: need at least 1, or None")
+
+
+class SimplerEnv:
+    """A batch of SIMPLER episodes; see ``vecenv.make``.
+
+    Args:
+        suite: ``simpler/bridge`` or ``simpler/google_robot``.
+        placement: task and episode of each slot.
+        config: options.
+
+    Raises:
+        SimplerError, AssetsMissing: something the options ask for does not exist.
+    """
+
+    def __init__(self, suite: str, placement: placing.Placement, config: SimplerConfig) -> None:
+        self.suite, self.config = suite, config
+        self.num_envs = len(placement)
+        self.tasks = list_tasks(suite)
+        self.robot = self.tasks[0].robot
+        self._root = config.assets or assets.simpler_root()
+        self._controller = robots.controller(self.robot, self._root / self.robot.urdf_path(), self.num_envs)
+        self._servo = Servo(self._controller, config.servo or ServoConfig.of(self.robot))
+        self._slots: Slots | None = make_slots(self._sizes(), self._num_workers())
+        # Where objects of an episode came to rest; settling is the dearest part of a reset.
+        self._settled: dict[tuple[int, int], np.ndarray] = {}
+        self._prepared: dict[tuple[int, int], Episode] = {}
+        self._chains: dict[str, kinematics.Chain] = {}
+        self._watchers: list[Watcher] = []
+        self._painter: Painter | None = None
+        self._place(placement)
+
+    def _sizes(self) -> Sizes:
+        robot = self.robot
+        return Sizes(slots=self.num_envs, substeps=robot.substeps, dof=robot.dof, objects=_MAX_OBJECTS)
+
+    def _num_workers(self) -> int:
+        return self.config.num_workers or len(os.sched_getaffinity(0))
+
+    # -- placement and lifecycle ---------------------------------------------------------------------------------------
+
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+        """Choose what each slot runs next; ``reset`` makes it live.
+
+        Args:
+            tasks: task of each slot, by name or index (B of them, or one for all); None keeps them.
+            episodes: episode of each slot, 0 to 49, likewise.
+
+        Raises:
+            PlacementError, UnknownTask: something that does not exist, or a wrong number of them.
+        """
+        self._check_open()
+        counts = {"num_tasks": len(self.tasks), "num_episodes": NUM_EPISODES}
+        self._place(placing.each(task_indices(self.suite, tasks), episodes, self._placement, **counts))
+
+    def _place(self, placement: placing.Placement) -> None:
+        self._placement = placement
+        b = self.num_envs
+        self._episodes = [
+            self._episode(int(task), int(episode))
+            for task, episode in zip(placement.task, placement.episode, strict=True)
+        ]
+        self._judges: list[Judge | None] = [None] * b
+        self._verdicts = [Verdict(False)] * b
+        self._live = np.zeros(b, bool)
+        self._terminated = np.zeros(b, bool)
+        self._truncated = np.zeros(b, bool)
+        self._success = np.zeros(b, bool)
+        self._steps = np.zeros(b, int)
+        self._reward = np.zeros(b)
+        self._fault = [""] * b
+        self._max_steps = np.array([self.config.max_steps or each.task.max_steps for each in self._episodes])
+
+    def _episode(self, task: int, episode: int) -> Episode:
+        key, chosen = (task, episode), self.tasks[task]
+        if key not in self._prepared:
+            self._prepared[key] = prepare(chosen, episode_layout(chosen, episode_seed(episode)), self._root)
+        return self._prepared[key]
+
+    def reset(self) -> ResetInfo:
+        """Make every slot live: finished slots are re-armed in place, live ones are left alone.
+
+        Returns:
+            Episode metadata of every slot; no observation.
+        """
+        self._check_open()
+        stale = ~self._live | self._done
+        if stale.any():
+            self._arm(stale)
+        tasks, episodes = self._placement.task, self._placement.episode
+        return ResetInfo(
+            instruction=self.instructions(),
+            episode_id=tuple(
+                f"{self.suite}/{self.tasks[task].name}/{episode}" for task, episode in zip(tasks, episodes, strict=True)
+            ),
+            suite=self.suite,
+            task_id=tasks.copy(),
+            max_steps=self._max_steps.copy(),
+        )
+
+    def instructions(self) -> tuple[str, ...]:
+        """What each slot's policy is told at present; tasks in two halves have two instructions."""
+        return tuple(self._instruction(slot) for slot in range(self.num_envs))
+
+    def _instruction(self, slot: int) -> str:
+        layout, judge = self._episodes[slot].layout, self._judges[slot]
+        second = judge is not None and judge.second_half(int(self._steps[slot]) + 1)
+        return layout.second_instruction if second else layout.instruction
+
+    def advance_subtask(self, slots: Any = None) -> None:
+        """Tell slots (bool [B], all by default) of tasks in two halves that the first half is done."""
+        chosen = np.ones(self.num_envs, bool) if slots is None else np.asarray(slots, bool)
+        for slot in np.flatnonzero(chosen):
+            judge = self._judges[slot]
+            if judge is not None:
+                judge.advance()
+
+    def _arm(self, stale: np.ndarray) -> None:
+        slots = np.flatnonzero(stale)
+        settled = self.slots.begin([self._job(int(slot)) for slot in slots])
+        for slot in slots:
+            self._settled.setdefault(self._key(int(slot)), settled[int(slot)])
+            episode = self._episodes[slot]
+            self._judges[slot] = Judge(episode.task, episode.roles, self._facts[slot])
+            self._fault[slot] = ""
+            self._verdicts[slot] = Verdict(False)
+        for array in (self._terminated, self._truncated, self._success, self._steps, self._reward):
+            array[stale] = 0
+        self._controller.reset(stale, self._facts["qpos"])
+        self._servo.forget(stale)
+        self._live |= stale
+        self._quarantine(stale)
+
+    def _key(self, slot: int) -> tuple[int, int]:
+        return int(self._placement.task[slot]), int(self._placement.episode[slot])
+
+    def _job(self, slot: int) -> Job:
+        episode = self._episodes[slot]
+        return Job(
+            slot=slot,
+            spec=episode.spec,
+            start=replace(episode.start, settled=self._settled.get(self._key(slot))),
+        )
+
+    def close(self) -> None:
+        """Release physics and its processes; the environment cannot be used afterwards. Closing twice is harmless."""
+        if self._slots is not None:
+            self._slots.close()
+        if self._painter is not None:
+            self._painter.close()
+        self._slots = self._painter = None
+
+    # -- stepping ------------------------------------------------------------------------------------------------------
+
+    def step_continuous(self, actions: Any) -> Control:
+        """Advance by one control tick, or by a chunk of K.
+
+        Args:
+            actions: [B, 7] or [B, K, 7], each row dx dy dz (metres), rotation vector (radians), gripper.
+
+        Raises:
+            ActionError: not numbers, or another shape.
+        """
+        self._check_live()
+        chunk, mended = validated(actions, self.num_envs)
+        chunk[..., 6] = self._native_gripper(chunk[..., 6])
+        self._servo.forget(np.ones(self.num_envs, bool))
+        before, reward = self._steps.copy(), np.zeros(self.num_envs)
+        for tick in range(chunk.shape[1]):
+            if self._done.all():
+                break
+            reward += self._tick(chunk[:, tick], ~self._done)
+        return self._control(Control, reward, mended, before)
+
+    def _native_gripper(self, values: np.ndarray) -> np.ndarray:
+        return values if self.config.gripper == "native" else self._servo.gripper(values)
+
+    def _tick(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """One control tick of the active slots; returns the rewards [B]."""
+        for watcher in self._watchers:
+            watcher(actions, active)
+        facts = self._facts
+        points = self._controller.set_action(actions, facts["qpos"], facts["qvel"], active)
+        self.slots.run(active, points.position, points.velocity)
+        self._steps += active
+        for slot in np.flatnonzero(active):
+            self._judge(int(slot))
+        self._terminated |= active & self._success
+        self._truncated |= active & ~self._success & (self._steps >= self._max_steps)
+        self._quarantine(active)
+        reward = np.where(active & self._success, 1.0, 0.0)
+        self._reward += reward
+        return reward
+
+    def _judge(self, slot: int) -> None:
+        judge = self._judges[slot]
+        if judge is None or self.slots.faults[slot]:
+            return
+        self._verdicts[slot] = judge.after(self._facts[slot], int(self._steps[slot]))
+        self._success[slot] = self._verdicts[slot].success
+
+    def _quarantine(self, among: np.ndarray) -> None:
+        for slot in np.flatnonzero(among):
+            reason = self.slots.faults[slot]
+            if reason and not self._fault[slot]:
+                self._fault[slot] = reason
+                self._truncated[slot] = True
+                self._terminated[slot] = self._success[slot] = False
+
+    def _control(self, kind: type, reward: np.ndarray, mended: np.ndarray, before: np.ndarray, **extra: Any) -> Any:
+        return kind(
+            reward=reward,
+            terminated=self._terminated.copy(),
+            truncated=self._truncated.copy(),
+            success=self._success.copy(),
+            step_index=self._steps.copy(),
+            info={
+                "mended": mended,
+                "fault": tuple(self._fault),
+                "ticks": self._steps - before,
+                "parts": tuple(verdict.parts for verdict in self._verdicts),
+                "stand_ins": tuple(episode.notes for episode in self._episodes),
+            },
+            **extra,
+        )
+
+    @contextmanager
+    def watched(self, watcher: Watcher) -> Iterator[None]:
+        """While inside, ``watcher(actions [B, 7], active bool [B])`` is called before every tick of any verb."""
+        self._watchers.append(watcher)
+        try:
+            yield
+        finally:
+            self._watchers.remove(watcher)
+
+    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+        """Drive each tool to an absolute pose, or hold it while the gripper moves.
+
+        Every slot goes on its own, as fast as ``config.servo`` lets it, until it is within tolerance, finished, or out
+        of ticks; it uses at least one tick, so the gripper command is always given. ``hold_steps`` > 0 skips the drive:
+        that many ticks holding still where the last call led. Poses are those of the tool (WidowX
+        ``ee_gripper_link``, Google Robot ``link_gripper_tcp``), the frame ``observe_objects`` reports.
+
+        Args:
+            poses: [B, 8] xyz (metres), wxyz, grip (1 closed, 0 open), world frame; empty for a no-op. Also a mapping
+                with ``pose`` and ``hold_steps``.
+            hold_steps: ticks to hold, one number or [B].
+
+        Raises:
+            ActionError: not numbers, or another shape.
+        """
+        self._check_live()
+        if isinstance(poses, Mapping):
+            poses, hold_steps = poses.get("pose", ()), poses.get("hold_steps", hold_steps)
+        targets, moves, errors = action_space.ee_poses(poses, self.num_envs)
+        hold = action_space.hold_steps(hold_steps, self.num_envs)
+        before, reward = self._steps.copy(), np.zeros(self.num_envs)
+        converged = self._follow(targets, hold, moves, reward)
+        return self._control(
+            EePoseControl,
+            reward,
+            np.zeros(self.num_envs, bool),
+            before,
+            converged=converged & moves,
+            final_pose=self._facts["tcp"].copy(),
+            step_count=self._steps - before,
+            error=errors,
+        )
+
+    def _follow(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray, reward: np.ndarray) -> np.ndarray:
+        """Drive or hold the slots in ``moves``; adds to ``reward`` and returns which are at their target, bool [B]."""
+        servo, driving = self._servo, hold == 0
+        servo.begin(self._facts["tcp"])
+        ticks = np.where(driving, servo.config.max_steps, hold)
+        going, used, arrived = moves & ~self._done, np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
+        while going.any():
+            actions = servo.actions(targets, driving, self._facts)
+            reward += self._tick(actions, going)
+            used += going
+            arrived = servo.arrived(targets, self._facts["tcp"])
+            going = going & ~self._done & (used < ticks) & ~(driving & arrived)
+        return arrived
+
+    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
+        """Follow a plan of waypoints, each slot its own, in one call.
+
+        A slot goes from waypoint to waypoint as ``step_ee_pose`` does and ends at the end of its plan, on success, when
+        its budget is spent, or after ``max_misses`` waypoints in a row out of reach.
+
+        Args:
+            plan: anything with ``poses`` [B, T, 7] (xyz in metres, wxyz, world frame), ``grip`` [B, T] (1 closed, 0
+                open), ``hold`` int [B, T] (ticks without motion in place of the drive) and ``valid`` bool [B, T].
+            max_misses: None never gives up.
+
+        Raises:
+            ActionError: not numbers, or another shape.
+        """
+        self._check_live()
+        checked, errors = action_space.plan(plan, self.num_envs)
+        followed = _Followed(self, checked, max_misses)
+        before = self._steps.copy()
+        reward = followed.run()
+        return self._control(
+            PlanControl,
+            reward,
+            np.zeros(self.num_envs, bool),
+            before,
+            converged=followed.converged,
+            waypoint_ticks=followed.ticks,
+            final_pose=self._facts["tcp"].copy(),
+            error=errors,
+        )
+
+    # -- perception ----------------------------------------------------------------------------------------------------
+
+    def observe_egocentric(self) -> Egocentric:
+        """What every slot's camera sees now, and its joints; pictures are drawn when they are first read.
+
+        ``state`` is qpos, qvel and base pose (xyz, wxyz), float32 [B, 23] or [B, 29]. The only camera is the
+        third-person one, 480 x 640 or 512 x 640; ``wrist_image`` is None. A slot whose physics failed shows black.
+        """
+        self._check_live()
+        facts = self._facts.copy()
+        state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
+        seen = _Seen(self._paint, tuple(self._episodes), facts, tuple(self._fault))
+        return SimplerEgocentric(
+            state=state.astype(np.float32),
+            images=Rendered([_CAMERA], lambda _: {_CAMERA: seen.stacked("rgb")}),
+            depths=Rendered([_CAMERA], lambda _: {_CAMERA: seen.stacked("depth")}),
+            segmentations=Rendered([_CAMERA], lambda _: {_CAMERA: seen.stacked("segmentation")}),
+            views={_CAMERA: self._view(facts)},
+            instances=tuple(instances(episode.spec) for episode in self._episodes),
+        )
+
+    def _paint(self, episode: Episode, facts: np.void, depth: bool) -> Picture:
+        from vecenv.simpler.overlay import Painter
+
+        if self._painter is None:
+            self._painter = Painter(self._root, self.config.overlay, self.config.shadows)
+        return self._painter.paint(episode, facts, depth)
+
+    def _view(self, facts: np.ndarray) -> CameraView:
+        cameras = [episode.task.camera for episode in self._episodes]
+        mounts = {camera.link: self._mounts(camera.link, facts) for camera in cameras}
+        mount = np.stack([mounts[camera.link][slot] for slot, camera in enumerate(cameras)])
+        local = rotation_from_quat(np.array([camera.quat for camera in cameras]))
+        turn = rotation_from_quat(mount[:, 3:])
+        position = mount[:, :3] + np.einsum("nij,nj->ni", turn, np.array([camera.position for camera in cameras]))
+        # SAPIEN's cameras look along x with z up; columns here are right, down and forward.
+        mat = (turn @ local) @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+        return CameraView(intrinsics=np.stack([camera.intrinsics for camera in cameras]), pos=position, mat=mat)
+
+    def _mounts(self, link: str, facts: np.ndarray) -> np.ndarray:
+        """World poses of a link, [B, 7]."""
+        if link == self.robot.root:
+            return facts["base"]
+        if link not in self._chains:
+            urdf = kinematics.read_urdf(self._root / self.robot.urdf_path())
+            self._chains[link] = urdf.chain(link, self.robot.joints)
+        position, rotation = self._chains[link].pose(facts["qpos"])
+        turn = rotation_from_quat(facts["base"][:, 3:])
+        world = facts["base"][:, :3] + np.einsum("nij,nj->ni", turn, position)
+        return np.concatenate([world, kinematics.quat_from_rotation(turn @ rotation)], axis=1)
+
+    def observe_objects(self, points: str = "surface") -> Objects:
+        """Ground truth of every slot.
+
+        Args:
+            points: ``"surface"``, points on the collision meshes; or ``"aabb"``, on the faces of the box around them.
+
+        Raises:
+            SimplerError: another value.
+        """
+        from vecenv.simpler import snapshot
+
+        self._check_live()
+        if points not in ("surface", "aabb"):
+            raise SimplerError(f"points={points!r}: expected 'surface' or 'aabb'")
+        return Objects(
+            snapshot=tuple(
+                None if fault else snapshot.take(episode, facts, points)
+                for episode, facts, fault in zip(self._episodes, self._facts, self._fault, strict=True)
+            ),
+            error=tuple(f"physics failed: {reason}" if reason else "" for reason in self._fault),
+        )
+
+    def evaluate(self) -> Metrics:
+        """The verdict of each slot as of its last executed tick."""
+        self._check_open()
+        return Metrics(
+            success=self._success.copy(),
+            num_steps=self._steps.copy(),
+            suite=self.suite,
+            task_id=self._placement.task.copy(),
+            cumulative_reward=self._reward.copy(),
+        )
+
+    @property
+    def stand_ins(self) -> tuple[tuple[str, ...], ...]:
+        """For each slot, what files are missing and what stands in for them."""
+        return tuple(episode.notes for episode in self._episodes)
+
+    # -- physics state -------------------------------------------------------------------------------------------------
+
+    @property
+    def slots(self) -> Slots:
+        """The physics of the batch."""
+        self._check_open()
+        assert self._slots is not None
+        return self._slots
+
+    @property
+    def _facts(self) -> np.ndarray:
+        return self.slots.facts
+
+    def state(self) -> State:
+        """Physics state of every slot, a copy: positions are the robot's, the drawers', then xyz + wxyz of the objects;
+        velocities the robot's, the drawers', then linear and angular ones of the objects."""
+        self._check_live()
+        facts = self._facts
+        rows = [self._split(slot) for slot in range(self.num_envs)]
+        nq, nv = (np.array([len(row[part]) for row in rows]) for part in (0, 1))
+        qpos, qvel = (np.zeros((self.num_envs, max(count))) for count in (nq, nv))
+        for slot, (position, velocity) in enumerate(rows):
+            qpos[slot, : len(position)], qvel[slot, : len(velocity)] = position, velocity
+        assert len(facts) == self.num_envs
+        return State(qpos=qpos, qvel=qvel, time=self._steps / self.robot.control_hz, nq=nq, nv=nv)
+
+    def _split(self, slot: int) -> tuple[np.ndarray, np.ndarray]:
+        facts, spec = self._facts[slot], self._episodes[slot].spec
+        drawers = slice(None) if spec.cabinet else slice(0)
+        count = len(spec.objects)
+        positions = [facts["qpos"], facts["drawers"][drawers], facts["objects"][:count].ravel()]
+        velocities = [facts["qvel"], facts["drawer_speeds"][drawers], facts["velocities"][:count].ravel()]
+        return np.concatenate(positions), np.concatenate(velocities)
+
+    def set_state(self, state: State) -> None:
+        """Overwrite the physics state of every slot; step counts, verdicts and the controllers' memory stay.
+
+        Args:
+            state: what ``state()`` returned, of the same placement.
+
+        Raises:
+            SimplerError: a wrong shape, or a number that is not finite.
+        """
+        self._check_live()
+        current = self.state()
+        for name in ("qpos", "qvel"):
+            have, need = np.asarray(getattr(state, name)), getattr(current, name)
+            if have.shape != need.shape:
+                raise SimplerError(f"set_state: {name} has shape {have.shape}; expected {need.shape}")
+            bad = ~np.isfinite(have).all(axis=1)
+            if bad.any():
+                raise SimplerError(f"set_state: {name} of slot {int(bad.argmax())} is not finite")
+        self.slots.restore({slot: self._joined(slot, state) for slot in range(self.num_envs)})
+        self._quarantine(np.ones(self.num_envs, bool))
+
+    def _joined(self, slot: int, state: State) -> np.ndarray:
+        """A slot's row in the order of ``scenes.Scene.state``."""
+        spec, qpos, qvel = self._episodes[slot].spec, state.qpos[slot], state.qvel[slot]
+        dof, drawers, count = self.robot.dof, 3 if spec.cabinet else 0, len(spec.objects)
+        joints = dof + drawers
+        poses, speeds = qpos[joints : joints + 7 * count], qvel[joints : joints + 6 * count]
+        things = np.concatenate([poses.reshape(-1, 7), speeds.reshape(-1, 6)], axis=1)
+        return np.concatenate([qpos[:dof], qvel[:dof], qpos[dof:joints], qvel[dof:joints], things.ravel()])
+
+    # -- helpers -------------------------------------------------------------------------------------------------------
+
+    @property
+    def _done(self) -> np.ndarray:
+        return self._terminated | self._truncated
+
+    def _check_open(self) -> None:
+        if self._slots is None:
+            raise SimplerError("the environment is closed")
+
+    def _check_live(self) -> None:
+        self._check_open()
+        if not self._live.all():
+            raise SimplerError("call reset() first: it makes the placed episodes live")
+
+
+@dataclass(frozen=True)
+class SimplerEgocentric(Egocentric):
+    """An observation with the third-person camera only."""
+
+    @property
+    def wrist_image(self) -> None:  # type: ignore[override]
+        """Always None: there is no wrist camera."""
+        return None
+
+    @property
+    def observation(self) -> list[np.ndarray]:
+        """The third-person camera's image alone."""
+        return [self.rgb]
+
+
+class _Seen:
+    """Pictures of all slots at one moment, drawn when the first of them is asked for; again when depth is missing."""
+
+    def __init__(
+        self,
+        paint: Callable[[Episode, np.void, bool], Picture],
+        episodes: tuple[Episode, ...],
+        facts: np.ndarray,
+        faults: tuple[str, ...],
+    ) -> None:
+        self._paint, self._episodes, self._facts, self._faults = paint, episodes, facts, faults
+        self._pictures: list[Picture | None] | None = None
+        self._deep = False
+
+    def stacked(self, field: str) -> np.ndarray:
+        """One field of the pictures, stacked; zeros where there is none."""
+        deep = field == "depth"
+        if self._pictures is None or (deep and not self._deep):
+            rows = zip(self._episodes, self._facts, self._faults, strict=True)
+            self._pictures = [None if fault else self._paint(episode, row, deep) for episode, row, fault in rows]
+            self._deep = deep
+        kinds = {"rgb": ((3,), np.uint8), "depth": ((), np.float32), "segmentation": ((), np.int16)}
+        camera, (tail, dtype) = self._episodes[0].task.camera, kinds[field]
+        out = np.zeros((len(self._pictures), camera.height, camera.width, *tail), dtype)
+        for slot, picture in enumerate(self._pictures):
+            if picture is not None:
+                out[slot] = getattr(picture, field)
+        return out
+
+
+class _Followed:
+    """A plan being followed: every slot is at its own waypoint."""
+
+    def __init__(self, env: SimplerEnv, plan: Any, max_misses: int | None) -> None:
+        self._env, self._max_misses = env, max_misses
+        self._targets = np.concatenate([plan.pose.pos, plan.pose.quat, np.asarray(plan.grip)[..., None]], axis=-1)
+        self._hold, self._valid = np.asarray(plan.hold), np.asarray(plan.valid)
+        self.converged = np.zeros(self._valid.shape, bool)
+        self.ticks = np.zeros(self._valid.shape, int)
+        b = len(self._valid)
+        self._at, self._misses = np.zeros(b, int), np.zeros(b, int)
+        self._rows = np.arange(b)
+
+    def run(self) -> np.ndarray:
+        """Follow it to the end; returns the rewards [B]."""
+        env, length = self._env, self._valid.shape[1]
+        servo, reward = env._servo, np.zeros(env.num_envs)
+        servo.begin(env._facts["tcp"])
+        self._skip()
+        while (going := (self._at < length) & ~env._done & self._patient()).any():
+            here = np.minimum(self._at, length - 1)
+            targets, driving = self._targets[self._rows, here], self._hold[self._rows, here] == 0
+            reward += env._tick(servo.actions(targets, driving, env._facts), going)
+            self.ticks[self._rows[going], here[going]] += 1
+            self._leave(going, here, targets, driving)
+        return reward
+
+    def _patient(self) -> np.ndarray:
+        return self._misses < self._max_misses if self._max_misses is not None else np.ones(len(self._at), bool)
+
+    def _leave(self, going: np.ndarray, here: np.ndarray, targets: np.ndarray, driving: np.ndarray) -> None:
+        env, rows = self._env, self._rows
+        arrived = env._servo.arrived(targets, env._facts["tcp"])
+        limit = np.where(driving, env._servo.config.max_steps, self._hold[rows, here])
+        spent = self.ticks[rows, here] >= limit
+        leaving = going & ((driving & arrived) | spent)
+        self.converged[rows[leaving], here[leaving]] = arrived[leaving]
+        missed = leaving & driving & ~arrived
+        self._misses = np.where(missed, self._misses + 1, np.where(leaving & driving, 0, self._misses))
+        self._at += leaving
+        self._skip()
+
+    def _skip(self) -> None:
+        """Go past waypoints that are not valid."""
+        length = self._valid.shape[1]
+        for row in self._rows:
+            while self._at[row] < length and not self._valid[row, self._at[row]]:
+                self._at[row] += 1
+
+
+def validated(actions: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray]:
+    """Actions [B, K, 7], finite and within ``ACTION_LIMITS``, and which slots had to be mended, bool [B].
+
+    Raises:
+        ActionError: the wrong shape or not numbers.
+    """
+    shape = action_space.continuous(actions, num_envs)[0].shape
+    raw = np.array(json.loads(actions) if isinstance(actions, str) else actions, float).reshape(shape)
+    mended = np.clip(np.nan_to_num(raw, nan=0.0, posinf=0.0, neginf=0.0), -ACTION_LIMITS, ACTION_LIMITS)
+    return mended, (mended != raw).any(axis=(1, 2))
+
+
+def task_indices(suite: str, tasks: Any) -> Any:
+    """Indices of tasks given by name, index, or several of either; None stays None."""
+    if tasks is None or isinstance(tasks, Mapping):
+        return tasks
+    if isinstance(tasks, str):
+        return find_task(suite, tasks).index
+    if isinstance(tasks, Sequence):
+        return [find_task(suite, task).index if isinstance(task, str) else task for task in tasks]
+    return tasks
+
+
+def make(suite: str, *, task: Any = None, tasks: Any = None, episodes: Any = None, **options: Any) -> SimplerEnv:
+    """A batch of SIMPLER episodes; ``vecenv.make`` documents the arguments.
+
+    Raises:
+        UnknownSuite, UnknownTask, PlacementError, SimplerError, AssetsMissing: something that does not exist.
+    """
+    known: tuple[SimplerTask, ...] = list_tasks(suite)
+    if task is not None and tasks is not None:
+        raise SimplerError("give task or tasks, not both")
+    chosen = task_indices(suite, tasks if task is None else task)
+    placement = placing.cross(
+        range(len(known)) if chosen is None else chosen,
+        range(NUM_EPISODES) if episodes is None else episodes,
+        num_tasks=len(known),
+        num_episodes=NUM_EPISODES,
+    )
+    return SimplerEnv(suite, placement, SimplerConfig(**options))
