@@ -1,4 +1,4 @@
-"""``vecenv voxposer show``: what the method makes of a task, as a page to turn around and to read.
+"""What ``vecenv voxposer show`` writes: what the method makes of a task, as a page to turn around and to read.
 
 A suite, a task and an episode come in; the task is planned and followed once, and an HTML page (plotly, one file, no
 network) and a PNG (matplotlib) go out. Each planned motion has a picture: the scene's surface, targets, what is kept
@@ -15,14 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
 
 from voxposer.agent import Agent, AgentConfig, Planned
 from voxposer.llm import Llm, LlmConfig
 from voxposer.lmp import Call
 from voxposer.steps import obstacle_map
-
-voxposer_app = typer.Typer(help="The VoxPoser planner.", no_args_is_help=True)
 
 # Voxels of an obstacle map above this are drawn, and no more than that many.
 _DRAWN_ABOVE = 0.3
@@ -59,36 +56,6 @@ class Shown:
     success: bool
     ticks: int
     cause: str
-
-
-@voxposer_app.callback()
-def _group() -> None:
-    """Keeps ``show`` a command of its own name while it is the only one."""
-
-
-@voxposer_app.command("show")
-def show_command(
-    task: str = typer.Argument(..., help="SUITE/TASK or SUITE/TASK/EPISODE, such as libero_goal/0."),
-    model: str = typer.Option("offline/libero", help="litellm's name of the model that writes the programs."),
-    out: Path = typer.Option(Path("voxposer_show"), help="Folder to write to."),
-    prompts_dir: Path | None = typer.Option(None, help="Folder of prompts to use.", show_default="the package's"),
-) -> None:
-    """Plan and follow a task once; write its maps, paths and programs as an HTML page and a PNG."""
-    from vecenv.cli import fail
-
-    try:
-        suite, number, episode = parse_task(task)
-    except ValueError as error:
-        fail(str(error))
-    shown = look_at(suite, number, episode, model=model, prompts_dir=prompts_dir)
-    out.mkdir(parents=True, exist_ok=True)
-    stem = out / shown.title.replace("/", "_")
-    page, picture = stem.with_suffix(".html"), stem.with_suffix(".png")
-    page.write_text(render_page(shown), encoding="utf-8")
-    save_picture(shown, picture)
-    typer.echo(f"{'solved' if shown.success else 'not solved'} in {shown.ticks} ticks {shown.cause}".rstrip())
-    typer.echo(page)
-    typer.echo(picture)
 
 
 def parse_task(text: str) -> tuple[str, int, int]:

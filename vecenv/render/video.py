@@ -7,6 +7,7 @@ In: images [B, H, W, 3] and a title a slot. Out: one image, or a file that any p
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -141,6 +142,8 @@ def _open(path: Path, fps: float) -> Any:
     except ImportError as error:
         raise RenderError("writing videos needs imageio and ffmpeg: pip install 'vecenv[render]'") from error
     path.parent.mkdir(parents=True, exist_ok=True)
+    # A child that is forked to give it a process group of its own cannot start beside large mappings (JAX's, GL's).
+    os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
     return imageio.get_writer(path, fps=fps, codec="libx264", quality=8, macro_block_size=1)
 
 
