@@ -328,9 +328,24 @@ def test_brax_trains_on_a_task(options: list[str], tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_derivatives_of_a_rollout_agree_with_finite_differences() -> None:
-    done = subprocess.run([sys.executable, EXAMPLES / "grad.py", "--ticks", "1"], capture_output=True, text=True)
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_derivatives_of_a_rollout_agree_with_finite_differences(mode: str) -> None:
+    command = [sys.executable, EXAMPLES / "grad.py", "--ticks", "1", "--mode", mode]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    rows = [line.split() for line in done.stdout.splitlines() if line.split()[1:2] and line.split()[1] in "xyz"]
-    assert len(rows) == 3
-    assert all(abs(float(row[2])) > 1e-5 for row in rows)
+    rows = [line.split() for line in done.stdout.splitlines()]
+    found = {row[1]: (float(row[2]), float(row[3])) for row in rows if len(row) == 5 and row[0] == "0"}
+    assert list(found) == ["x", "y", "z", "rx", "ry", "rz", "gripper"]
+    slopes, differences = np.array(list(found.values())).T
+    assert (np.abs(slopes[:6]) > 1e-4).all()
+    np.testing.assert_allclose(slopes[:3], differences[:3], rtol=1e-5)
+    np.testing.assert_allclose(slopes[3:6], differences[3:6], rtol=0.02)
+    assert slopes[6] == differences[6] == 0
+
+
+def test_a_wrong_option_of_grad_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, message in ((["--ticks", "0"], "at least 1"), (["--task", "10"], "0 to 9")):
+        with pytest.raises(SystemExit) as ended:
+            imported("grad").main(arguments)
+        assert ended.value.code == 2
+        assert message in capsys.readouterr().err

@@ -134,7 +134,7 @@ def _problem(model: mjx.Model, data: mjx.Data) -> _Problem:
 
 
 class _Curvature(NamedTuple):
-    """Second derivatives: of rows by themselves [R] (0 for cones), and of cones [n, dim, dim]."""
+    """Second derivatives: of the rows before the first cone, and of cones [n, dim, dim]."""
 
     alone: jax.Array
     cones: tuple[jax.Array, ...]
@@ -142,26 +142,26 @@ class _Curvature(NamedTuple):
 
 def _pull(layout: _Layout, problem: _Problem, x: jax.Array) -> tuple[jax.Array, _Curvature]:
     """First derivative [R] and second derivatives of the cost of the rows at x = J a - aref, [R]."""
-    slope, alone = _pull_alone(layout, problem, x)
-    blocks = []
+    alone = layout.cones[0][1] if layout.cones else len(x)
+    first, second = _pull_alone(layout, problem, x[:alone])
+    slopes, blocks = [first], []
     for (dim, row, _, count), cones in zip(layout.cones, problem.cones, strict=True):
-        rows = slice(row, row + dim * count)
-        first, second = jax.vmap(_pull_cone)(x[rows].reshape(count, dim), cones)
-        slope, alone = slope.at[rows].set(first.reshape(-1)), alone.at[rows].set(0.0)
-        blocks.append(second)
-    return slope, _Curvature(alone, tuple(blocks))
+        slope, block = jax.vmap(_pull_cone)(x[row : row + dim * count].reshape(count, dim), cones)
+        slopes.append(slope.reshape(-1))
+        blocks.append(block)
+    return jnp.concatenate(slopes), _Curvature(second, tuple(blocks))
 
 
 def _pull_alone(layout: _Layout, problem: _Problem, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """As if every row were by itself: equalities pull both ways, limits and pyramids' edges one way, friction slips."""
-    index = np.arange(x.shape[0])
+    """Of rows by themselves: equalities pull both ways, limits and edges of pyramids one way, dry friction slips."""
+    index, stiff, rub = np.arange(len(x)), problem.stiff[: len(x)], problem.rub[: len(x)]
     equal, rubbing = index < layout.equal, (index >= layout.equal) & (index < layout.equal + layout.rubbing)
-    slope = problem.stiff * x
-    slips = rubbing & (jnp.abs(slope) > problem.rub)
+    slope = stiff * x
+    slips = rubbing & (jnp.abs(slope) > rub)
     lets_go = ~equal & ~rubbing & (x >= 0)
     free = slips | lets_go
-    slope = jnp.where(free, jnp.where(slips, jnp.sign(x) * problem.rub, 0.0), slope)
-    return slope, jnp.where(free, 0.0, problem.stiff)
+    slope = jnp.where(free, jnp.where(slips, jnp.sign(x) * rub, 0.0), slope)
+    return slope, jnp.where(free, 0.0, stiff)
 
 
 def _pull_cone(x: jax.Array, cone: _Cones) -> tuple[jax.Array, jax.Array]:
@@ -189,12 +189,14 @@ def _pull_cone(x: jax.Array, cone: _Cones) -> tuple[jax.Array, jax.Array]:
 
 def _bent(layout: _Layout, curvature: _Curvature, rows: jax.Array) -> jax.Array:
     """Curvature times rows, [R] or [R, nv]."""
-    out = (curvature.alone * rows.T).T
+    alone = layout.cones[0][1] if layout.cones else len(rows)
+    parts = [(curvature.alone * rows[:alone].T).T]
     for (dim, row, _, count), blocks in zip(layout.cones, curvature.cones, strict=True):
-        own = slice(row, row + dim * count)
-        turned = jnp.einsum("nij,nj...->ni...", blocks, rows[own].reshape(count, dim, *rows.shape[1:]))
-        out = out.at[own].set(turned.reshape(dim * count, *rows.shape[1:]))
-    return out
+        own = rows[row : row + dim * count].reshape(count, dim, -1)
+        # Written out, because so small matrices are multiplied slower by a library than in one loop.
+        turned = sum(blocks[:, :, j, None] * own[:, None, j] for j in range(dim))
+        parts.append(jnp.asarray(turned).reshape(dim * count, *rows.shape[1:]))
+    return jnp.concatenate(parts)
 
 
 def _gradient(layout: _Layout, problem: _Problem, qacc: jax.Array) -> jax.Array:
@@ -215,15 +217,20 @@ class _Islands(NamedTuple):
 
 
 def _islands(layout: _Layout, jacobian: jax.Array) -> _Islands:
-    count = layout.trees.shape[1]
-    moved = (jnp.abs(jacobian) @ layout.trees.astype(jacobian.dtype)) > 0
-    first = moved & (jnp.cumsum(moved, axis=1) == 1)
-    mates = (moved.T.astype(jacobian.dtype) @ moved) > 0
-    mates = mates | jnp.eye(count, dtype=bool)
+    count, dtype = layout.trees.shape[1], jacobian.dtype
+    alone = layout.cones[0][1] if layout.cones else len(jacobian)
+    # A contact's rows move the same trees, so they count as one.
+    parts, rows_of = [jnp.abs(jacobian[:alone])], [np.arange(alone)]
+    for dim, row, _, number in layout.cones:
+        parts.append(jnp.abs(jacobian[row : row + dim * number]).reshape(number, dim, -1).sum(1))
+        rows_of.append(np.repeat(rows_of[-1].max(initial=-1) + 1 + np.arange(number), dim))
+    moved = (jnp.concatenate(parts) @ layout.trees.astype(dtype)) > 0
+    mates = ((moved.T.astype(dtype) @ moved) > 0) | jnp.eye(count, dtype=bool)
     for _ in range(int(np.ceil(np.log2(max(count, 2))))):
-        reach = mates.astype(jacobian.dtype)
+        reach = mates.astype(dtype)
         mates = (reach @ reach) > 0
-    return _Islands(first.astype(jacobian.dtype), mates.astype(jacobian.dtype))
+    first = (jnp.arange(count) == jnp.argmax(moved, axis=1)[:, None]) & moved
+    return _Islands(first.astype(dtype)[np.concatenate(rows_of)], mates.astype(dtype))
 
 
 class _Carry(NamedTuple):
