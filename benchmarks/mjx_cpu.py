@@ -1,9 +1,10 @@
 """MJX on a CPU: control steps a second beside native MuJoCo, XLA's fusion trap, and how long compiling takes.
 
-Three tables in one file, told apart by the column ``what``. "control steps": the batched environment on ``impl="jax"``
-with lean geometry against the native backend on the same scene and actions, in alternation. "fusion trap": the same
-function compiled with the options of ``vecenv.physics.mjx.compiler_options`` and without. "compile": seconds to trace
-and to compile a chunk of control steps in a process with empty caches, and in a second process that finds them.
+The rows: the batched environment on ``impl="jax"`` with lean geometry against the native backend on the same scene
+and actions, in alternation, and the processor time of all cores that a step takes, which others' work changes little.
+Beside them in the file, "fusion trap": a function compiled with the options of
+``vecenv.physics.mjx.compiler_options`` and without; and "compile": seconds to trace and to compile a chunk of control
+steps in a process with empty caches, and in a second process that finds them.
 """
 
 from __future__ import annotations
@@ -31,14 +32,13 @@ def main() -> None:
     if options.part:
         print(json.dumps(PARTS[options.part](options)))
         return
-    rows: list[dict[str, Any]] = [apart("speed", options, scene=scene) for scene in options.scene]
-    rows += [apart("trap", options, scene=options.scene[0], function=name) for name in options.function]
-    for backend in options.backend:
-        for scene in options.compile:
-            rows.append(compiled_twice(backend, scene, options))
-    print("\n".join(map(str, rows)))
-    columns = list(dict.fromkeys(column for row in rows for column in row))
-    report("mjx_cpu", [{column: row.get(column, "") for column in columns} for row in rows], title="MJX on a CPU")
+    speeds = [apart("speed", options, scene=scene) for scene in options.scene]
+    traps = [apart("trap", options, scene=options.scene[0], function=name) for name in options.function]
+    compiling = [compiled_twice(backend, scene, options) for backend in options.backend for scene in options.compile]
+    for row in traps + compiling:
+        print(row)
+    notes = {"fusion trap": traps, "compile": compiling}
+    report("mjx_cpu", speeds, title="MJX on a CPU: control steps a second", notes=notes)
 
 
 def arguments() -> argparse.Namespace:
@@ -87,7 +87,6 @@ def speed(options: argparse.Namespace) -> dict[str, Any]:
     rates = [calls * batch * TICKS for calls in alternate(list(sides), options.rounds, options.seconds)]
     work = [processor_seconds(run) / (batch * TICKS) for run in sides]
     return {
-        "what": "control steps",
         "scene": scene,
         "backend": "jax",
         "geometry": "lean",
@@ -157,7 +156,6 @@ def trap(options: argparse.Namespace) -> dict[str, Any]:
     sides = [lambda: ours(*arguments), lambda: plain(*arguments)]
     rates = alternate(list(sides), options.rounds, options.seconds)
     return {
-        "what": "fusion trap",
         "scene": scene,
         "backend": "jax",
         "geometry": "lean",
@@ -176,7 +174,7 @@ def compiled_twice(backend: str, scene: str, options: argparse.Namespace) -> dic
     """A row: with empty caches, and in another process that finds what the first one left."""
     with tempfile.TemporaryDirectory() as folder:
         cold, warm = (apart("compile", options, backend=backend, compile=scene, folder=folder) for _ in range(2))
-    row = {"what": "compile", "scene": scene, "backend": backend, "geometry": "lean", "B": options.batch}
+    row = {"scene": scene, "backend": backend, "geometry": "lean", "B": options.batch}
     for name, found in (("cold", cold), ("warm", warm)):
         row |= {f"{name}: {column}": value for column, value in found.items()}
     return row

@@ -172,6 +172,13 @@ def test_a_measured_budget_has_room_for_the_starts(warp: LiberoEnv) -> None:
     assert int(np.asarray(data.nacon).max()) < SLOTS * group.built.budget.contacts  # type: ignore[attr-defined]
 
 
+def test_worlds_share_contact_memory_when_the_share_is_known() -> None:
+    budget = Budget(contacts=100, rows=30, pairs=1, candidates=120)
+    assert budget.warp_sizes(3) == {"naconmax": 360, "njmax": 30}
+    assert replace(budget, share=40).warp_sizes(3)["naconmax"] == 120 + 2 * 40
+    assert replace(budget, share=400).warp_sizes(3)["naconmax"] == 360
+
+
 def test_fault_text_names_every_bit() -> None:
     assert fault_text(1 | 1 << 30) == "more constraint rows than the budget njmax; non-finite or huge state"
 

@@ -26,11 +26,11 @@ from vecenv.libero.scene import CONTACT_LIMIT, PAIR_LIMIT, Scene
 from vecenv.physics.base import Group, Start
 
 # Factors on the most that was seen.
-MARGINS = {"contacts": 1.25, "rows": 1.75, "pairs": 1.5, "candidates": 1.5}
+MARGINS = {"contacts": 1.25, "rows": 1.3, "pairs": 1.5, "candidates": 1.5, "share": 1.75}
 # Control ticks of the two rollouts.
 FLAILING, GRASPING = 60, 80
 # Part of the cache key: raised when what is measured changes.
-VERSION = 4
+VERSION = 6
 _HOLD = 5
 _DOWNWARDS = np.array([0, 0, -0.5, 0, 0, 0, 0])
 # A grasp: ticks until the hand is above an object, on it, holds it, has dragged it about, and has pressed it down.
@@ -54,21 +54,26 @@ class Budget:
         pairs: pairs of geoms of one type of collision whose bounding spheres overlap, in one world (jax).
         candidates: pairs of geoms whose oriented bounding boxes overlap, in one world; warp keeps them where contacts
             go.
+        share: what a world of a large batch adds to the memory that warp's worlds share for contacts and candidates;
+            as much as the fullest world by default. Worlds are never all as full as the fullest.
     """
 
     contacts: int
     rows: int
     pairs: int
     candidates: int
+    share: int | None = None
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if value < 1:
+            if value is not None and value < 1:
                 raise BudgetError(f"{name}={value}: need at least 1")
 
     def warp_sizes(self, num_worlds: int) -> dict[str, int]:
         """Arguments for ``mjx.make_data(impl="warp")``."""
-        return {"naconmax": max(self.contacts, self.candidates) * num_worlds, "njmax": self.rows}
+        fullest = max(self.contacts, self.candidates)
+        others = fullest if self.share is None else min(self.share, fullest)
+        return {"naconmax": fullest + (num_worlds - 1) * others, "njmax": self.rows}
 
     def limited(self, model: mujoco.MjModel) -> mujoco.MjModel:
         """A copy of the model with the limits that ``impl="jax"`` reads.
@@ -104,12 +109,14 @@ def measure(scene: Scene, starts: Start, *, ticks: tuple[int, int] = (FLAILING, 
     physics = NativePhysics([scene], np.zeros(worlds, int))
     group = physics.groups[0]
     contacts, rows, pos, mat = (group.bind(name) for name in ("ncon", "nefc", "geom_xpos", "geom_xmat"))
-    pairs, seen = _Pairs(scene.model), np.ones(4)
+    pairs, seen = _Pairs(scene.model), np.ones(len(MARGINS))
     for count, actions in zip(ticks, (_flailing(worlds), _grasping(scene, group)), strict=True):
         physics.place(group, np.arange(worlds), starts)
         for _ in range(count):
             physics.control_step(np.clip(next(actions), -1, 1), np.ones(worlds, bool))
-            seen = np.maximum(seen, (contacts.max(), rows.max(), *pairs.most_near(pos, mat)))
+            of_one_kind, near = pairs.near(pos, mat)
+            share = max(contacts.mean(), near.mean())
+            seen = np.maximum(seen, (contacts.max(), rows.max(), of_one_kind, near.max(), share))
     physics.close()
     return Budget(**{name: math.ceil(most * MARGINS[name]) for name, most in zip(MARGINS, seen, strict=True)})
 
@@ -180,8 +187,8 @@ class _Pairs:
         self._endless = endless
         self._centre, self._half = model.geom_aabb[:, :3], model.geom_aabb[:, 3:]
 
-    def most_near(self, pos: np.ndarray, mat: np.ndarray) -> tuple[int, int]:
-        """The most pairs in any world: of one type with overlapping spheres, and of all with overlapping boxes.
+    def near(self, pos: np.ndarray, mat: np.ndarray) -> tuple[int, np.ndarray]:
+        """The most pairs of one type with overlapping spheres in any world; each world's with overlapping boxes, [S].
 
         Args:
             pos: positions of the geoms, metres, [S, ngeom, 3].
@@ -191,7 +198,7 @@ class _Pairs:
         of_one = [int(near[:, chosen].sum(1).max()) for chosen in self._of_kind]
         world, pair = np.nonzero(near)
         meets = self._boxes_meet(pos, mat.reshape(*mat.shape[:2], 3, 3), world, pair)
-        return max(of_one, default=1), int(np.bincount(world, meets, len(pos)).max(initial=1))
+        return max(of_one, default=1), np.bincount(world, meets, len(pos))
 
     def _boxes_meet(self, pos: np.ndarray, mat: np.ndarray, world: np.ndarray, pair: np.ndarray) -> np.ndarray:
         """Whether the bounding boxes of these pairs overlap along all six axes of their faces; planes always do."""
