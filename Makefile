@@ -10,24 +10,31 @@ PYTHON ?=
 EVAL_ARGS ?= --suite libero_object --policy pick_place --episodes 5
 # Test processes; each compiles its own JAX functions and takes about 1 GB.
 WORKERS ?= 2
+# What `make system` does: install, or dry to print the commands.
+SYSTEM ?= install
 # More arguments for pytest, say TEST_ARGS="tests/test_cli.py -k doctor".
 TEST_ARGS ?=
 
 RUN := $(VENV)/bin
 PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help setup eval test test-heavy parity bench settled lint format doctor dist-check clean distclean
+.PHONY: help setup system eval test test-heavy parity bench settled lint format doctor dist-check clean distclean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(VENV)/.installed-dev ## Make .venv and install vecenv in it with everything for development
 
+system: ## Install what pictures need of the system (GL, Vulkan), where apt and root are there; else print how
+	@scripts/system.sh $(SYSTEM)
+
 eval: $(VENV)/.installed-eval ## Evaluate pick_place on libero_object: 10 tasks x 5 episodes, table and results folder
+	@scripts/system.sh check
 	@echo "==> vecenv eval $(EVAL_ARGS)"
 	@$(RUN)/vecenv eval $(EVAL_ARGS)
 
 test: $(VENV)/.installed-dev ## Run the tests, all but those marked heavy
+	@scripts/system.sh check
 	@echo "==> pytest, $(WORKERS) processes, without the tests marked heavy"
 	@$(PYTEST) -m "not heavy" $(TEST_ARGS)
 

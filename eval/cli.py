@@ -41,7 +41,7 @@ def eval_command(
     policy: str | None = typer.Option(
         None, help="random, zero, pick_place, voxposer, or your own module:Class.", show_default="pick_place"
     ),
-    tasks: str | None = typer.Option(None, help="all, or indices and ranges: 0,3,5-7.", show_default="all"),
+    tasks: str | None = typer.Option(None, help="all, or indices, ranges and names: 0,3,5-7.", show_default="all"),
     episodes: str | None = typer.Option(None, help="all, a count, or indices and ranges: 0,3,5-7.", show_default="all"),
     policy_arg: list[str] | None = typer.Option(
         None, help="key=value for the policy; repeatable.", show_default="none"
@@ -50,8 +50,12 @@ def eval_command(
     max_steps: int | None = typer.Option(None, min=1, help="Step budget of an episode.", show_default="the suite's"),
     seed: int | None = typer.Option(None, help="Seed of environment and policy.", show_default="0"),
     env_arg: list[str] | None = typer.Option(None, help="key=value for vecenv.make; repeatable.", show_default="none"),
-    num_envs: int | None = typer.Option(None, min=1, help="Most episodes that run at once.", show_default="256"),
-    num_threads: int | None = typer.Option(None, min=1, help="Threads of the physics.", show_default="the backend's"),
+    num_envs: int | None = typer.Option(
+        None, min=1, help="Most episodes that run at once.", show_default="the suite's"
+    ),
+    num_threads: int | None = typer.Option(
+        None, min=1, help="Threads of the physics (SIMPLER: processes).", show_default="the backend's"
+    ),
     out: Path | None = typer.Option(None, help="Results folder to make.", show_default="results/TIME_SUITE_POLICY"),
     resume: Path | None = typer.Option(
         None, help="Results folder to go on with; it keeps its settings.", show_default="none"
@@ -121,8 +125,8 @@ def _check_task(suite: str | None, task: int | None) -> None:
         if task is not None:
             fail("--task needs --suite")
         return
-    if suite not in vecenv.list_suites():
-        fail(unknown("suite", suite, vecenv.list_suites()))
+    if suite not in vecenv.list_suites("libero"):
+        fail(unknown("suite", suite, vecenv.list_suites("libero")))
     count = len(vecenv.list_tasks(suite))
     if task is not None and task >= count:
         fail(f"--task {task}: {suite} has tasks 0 to {count - 1}")
@@ -188,10 +192,14 @@ def _run(evaluation: Evaluation, store: ResultStore, quiet: bool) -> int:
 
 
 def _print_result(console: Console, result: EvalResult) -> None:
-    from eval.report import closing_line, table
+    from eval.report import STAND_INS, closing_line, stand_in_lines, table
 
     console.print(table(result.summary))
     console.print(closing_line(result.summary), highlight=False, soft_wrap=True)
+    if result.summary.stand_ins:
+        console.print(f"{STAND_INS}:", style="yellow")
+    for line in stand_in_lines(result.summary):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     for cause in result.causes:
         console.print(f"error in a batch: {cause}", style="red", markup=False, highlight=False, soft_wrap=True)
     if not result.ok:

@@ -46,6 +46,8 @@ _MAX_TEXT = 1 << 25
 _NAME = re.compile(r"demo_?(\d+)")
 # The options of ``vecenv.make`` that decide where an episode begins and how it goes; no path is among them.
 _OPTIONS = frozenset({"backend", "geometry", "fixtures", "start", "settle_steps", "max_steps", "seed"})
+# Types of those that do not have the type of their default alone.
+_KINDS = {"fixtures": (str, dict), "max_steps": (int,)}
 # What h5py and NumPy raise over a file that is damaged or holds something else.
 _DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError)
 
@@ -281,8 +283,8 @@ def _made_start(group: h5py.Group) -> MadeStart:
 
 def _check_option(name: str, value: Any, default: Any) -> None:
     """What is wrong with the value itself is found by ``vecenv.make``."""
-    kinds = (str, dict) if name == "fixtures" else (type(default),)
-    if default is not None and type(value) not in kinds:
+    kinds = _KINDS.get(name, (type(default),))
+    if type(value) not in kinds:
         raise DemoError(f"attribute make: {name}={value!r:.50}: expected {kinds[-1].__name__}")
     if name == "settle_steps" and value > MAX_SETTLE_STEPS:
         raise DemoError(f"attribute make: settle_steps={value}: more than {MAX_SETTLE_STEPS:,}")
@@ -511,10 +513,10 @@ def _shape(shape: Sequence[int] | None) -> str:
 
 
 def make_options(make: Callable[..., Any], **arguments: Any) -> dict[str, Any]:
-    """What ``make(**arguments)`` says about how episodes begin and go, its defaults included."""
+    """What ``make(**arguments)`` says about how episodes begin and go, its defaults included (but not ``None``)."""
     bound = inspect.signature(make).bind_partial(**arguments)
     bound.apply_defaults()
-    return {name: value for name, value in bound.arguments.items() if name in _OPTIONS}
+    return {name: value for name, value in bound.arguments.items() if name in _OPTIONS and value is not None}
 
 
 def write_demos(path: Path, suite: str, task: int, instruction: str, recordings: Sequence[Recording]) -> None:

@@ -6,11 +6,14 @@ episodes, at most ``num_envs`` slots each, tasks that share a scene side by side
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise, product
 
 ALL = "all"
+# Most episodes that run at once, where neither the user nor the suite says otherwise.
+MAX_SLOTS = 256
 
 
 class SpecError(ValueError):
@@ -46,12 +49,16 @@ class Suite:
         instructions: language instruction of each task.
         scenes: what each task needs built; tasks with equal entries share it.
         num_episodes: episodes of each task.
+        tasks: name of each task, by which it may be asked for; may be empty.
+        max_slots: most episodes to run at once unless told otherwise.
     """
 
     name: str
     instructions: tuple[str, ...]
     scenes: tuple[Hashable, ...]
     num_episodes: int
+    tasks: tuple[str, ...] = ()
+    max_slots: int = MAX_SLOTS
 
 
 @dataclass(frozen=True)
@@ -77,13 +84,18 @@ class Batch:
         return len(self.tasks) * len(self.episodes)
 
 
-def parse_tasks(spec: str, num_tasks: int) -> tuple[int, ...]:
-    """Read task indices: ``"all"``, or indices and ranges such as ``"0,3,5-7"``.
+def parse_tasks(spec: str, num_tasks: int, names: Sequence[str] = ()) -> tuple[int, ...]:
+    """Read task indices: ``"all"``, or indices, ranges and names such as ``"0,3,5-7,widowx_stack_cube"``.
+
+    Args:
+        spec: the text.
+        num_tasks: how many tasks the suite has.
+        names: what they are called.
 
     Raises:
         SpecError: the text cannot be read, or names a task the suite does not have.
     """
-    return tuple(range(num_tasks)) if spec.strip() == ALL else _parse_indices(spec, num_tasks, "task")
+    return tuple(range(num_tasks)) if spec.strip() == ALL else _parse_indices(spec, num_tasks, "task", names)
 
 
 def parse_episodes(spec: str, num_episodes: int) -> tuple[int, ...]:
@@ -154,18 +166,24 @@ def _even_chunks(items: Sequence[int], most: int) -> Iterator[tuple[int, ...]]:
         yield tuple(items[start:stop])
 
 
-def _parse_indices(spec: str, count: int, what: str) -> tuple[int, ...]:
+def _parse_indices(spec: str, count: int, what: str, names: Sequence[str] = ()) -> tuple[int, ...]:
     parts = [part.strip() for part in spec.split(",") if part.strip()]
     if not parts:
         raise SpecError(f"no {what} named in {spec!r}")
-    indices = [index for part in parts for index in _parse_range(part, count, what)]
+    indices = [index for part in parts for index in _parse_part(part, count, what, names)]
     return tuple(dict.fromkeys(indices))
 
 
-def _parse_range(part: str, count: int, what: str) -> range:
+def _parse_part(part: str, count: int, what: str, names: Sequence[str]) -> Sequence[int]:
+    return (names.index(part),) if part in names else _parse_range(part, count, what, names)
+
+
+def _parse_range(part: str, count: int, what: str, names: Sequence[str]) -> range:
     low, dash, high = part.partition("-")
     if not low.strip().isdecimal() or (dash and not high.strip().isdecimal()):
-        raise SpecError(f"cannot read {part!r} as {what}s: write indices and ranges such as 0,3,5-7, or 'all'")
+        near = difflib.get_close_matches(part, names, n=3)
+        close = f"; did you mean {', '.join(near)}?" if near else ""
+        raise SpecError(f"cannot read {part!r} as {what}s: write indices and ranges such as 0,3,5-7, or 'all'{close}")
     start, stop = int(low), int(high) if dash else int(low)
     if stop < start:
         raise SpecError(f"the range {part!r} of {what}s runs backwards")

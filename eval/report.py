@@ -23,6 +23,7 @@ from eval.store import Record
 
 CONFIDENCE = 0.95
 TOTAL = "all"
+STAND_INS = "Files were missing, and something plain stood in for them"
 _TEXT = "instruction"
 _COLUMNS = ("task", _TEXT, "solved", "rate", "95 % interval", "steps", "faults", "errors", "not run")
 # The last columns count what went wrong; on the screen they take room only when something did.
@@ -73,6 +74,7 @@ class Summary:
         steps_per_s: ``steps / wall_s``.
         extras: what the policy reported (``Record.extras``), by name: the mean an episode of what is a number, how
             often each was said of what is words.
+        stand_ins: how many episodes ran with what in place of a missing file.
     """
 
     suite: str
@@ -84,6 +86,7 @@ class Summary:
     wall_s: float
     steps_per_s: float
     extras: Mapping[str, float | dict[str, int]] = field(default_factory=dict)
+    stand_ins: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
@@ -137,6 +140,7 @@ def summarise(
         wall_s=wall_s,
         steps_per_s=steps / wall_s if wall_s else 0.0,
         extras=_extras(found),
+        stand_ins=dict(Counter(note for record in found for note in record.stand_ins).most_common()),
     )
 
 
@@ -164,7 +168,8 @@ def markdown(summary: Summary) -> str:
     extras = _extras_lines(summary)
     reported = ["", "Reported by the policy, means an episode and counts:", "", *extras] if extras else []
     title = f"# {summary.suite}, policy {summary.policy}"
-    return "\n".join([title, "", *lines, "", closing_line(summary), *reported, ""])
+    missing = ["", f"{STAND_INS}:", "", *stand_in_lines(summary)] if summary.stand_ins else []
+    return "\n".join([title, "", *lines, "", closing_line(summary), *missing, *reported, ""])
 
 
 def closing_line(summary: Summary) -> str:
@@ -175,6 +180,11 @@ def closing_line(summary: Summary) -> str:
         f"{summary.steps:,} control steps in {summary.wall_s:.1f} s "
         f"({summary.steps_per_s:,.0f} steps/s, policy included), after {summary.setup_s:.1f} s of setup."
     )
+
+
+def stand_in_lines(summary: Summary) -> list[str]:
+    """What stood in for missing files, and in how many episodes; one line each."""
+    return [f"- {count} episodes: {note}" for note, count in summary.stand_ins.items()]
 
 
 def _row(task: int | str, instruction: str, records: Sequence[Record], planned: int) -> Row:

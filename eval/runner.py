@@ -21,15 +21,19 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from eval.episodes import Batch, Episode, Suite, parse_episodes, parse_tasks, plan
+from eval.episodes import MAX_SLOTS, Batch, Episode, Suite, parse_episodes, parse_tasks, plan
 from eval.policies import Policy, extras_of, make_policy
 from eval.report import Summary, markdown, summarise
 from eval.store import CONFIG, Record, ResultStore, StoreError
+from vecenv.assets import AssetsMissing
 from vecenv.cli import unknown
 from vecenv.contract import BatchEnv, Control, Metrics, ResetInfo
 
 # Called with which slots have just finished, bool [B], with the verdicts, bool [B], and with the faults, B strings.
 _Finish: TypeAlias = Callable[[np.ndarray, np.ndarray, Sequence[str]], None]
+_SIMPLER = "simpler"
+# A slot of SIMPLER is a PhysX scene of its own.
+_SIMPLER_SLOTS = 50
 # Calls of a policy in a row that may leave every live slot where it was, before it counts as stuck.
 MAX_IDLE_CALLS = 100
 
@@ -50,10 +54,10 @@ class EvalConfig:
         suite: name of the suite.
         policy: name of the policy, see ``eval.policies.make_policy``.
         policy_args: constructor arguments of the policy.
-        tasks: ``"all"``, or indices and ranges such as ``"0,3,5-7"``.
+        tasks: ``"all"``, or indices, ranges and names such as ``"0,3,5-7"`` or ``"widowx_stack_cube"``.
         episodes: ``"all"``, a bare number for that many from the first on, or indices and ranges.
         backend: physics backend.
-        num_envs: most episodes that run at once.
+        num_envs: most episodes that run at once, None for what suits the suite.
         num_threads: threads of the physics, None for the backend's own choice.
         max_steps: step budget of an episode in control ticks, None for the suite's own.
         seed: seed of the environment, and of the policy if it takes one.
@@ -69,7 +73,7 @@ class EvalConfig:
     tasks: str = "all"
     episodes: str = "all"
     backend: str = "native"
-    num_envs: int = 256
+    num_envs: int | None = None
     num_threads: int | None = None
     max_steps: int | None = None
     seed: int = 0
@@ -161,11 +165,15 @@ def describe_suite(name: str) -> Suite:
     if name not in suites:
         raise ConfigError(unknown("suite", name, suites))
     tasks = vecenv.list_tasks(name)
+    simpler = vecenv.family(name) == _SIMPLER
     return Suite(
         name=name,
         instructions=tuple(task.instruction for task in tasks),
-        scenes=tuple(task.problem().scene_key() for task in tasks),
+        # SIMPLER exchanges scenes by itself, so its environments need no new one for other tasks.
+        scenes=tuple("" if simpler else task.problem().scene_key() for task in tasks),
         num_episodes=vecenv.eval_metadata(name)["episodes_per_task"],
+        tasks=tuple(task.name for task in tasks),
+        max_slots=_SIMPLER_SLOTS if simpler else MAX_SLOTS,
     )
 
 
@@ -222,9 +230,10 @@ class Evaluation:
         self.config = config
         self.simulator = simulator or vecenv_simulator()
         self.suite = self.simulator.suite(config.suite)
-        self.tasks = parse_tasks(config.tasks, len(self.suite.instructions))
+        self.tasks = parse_tasks(config.tasks, len(self.suite.instructions), self.suite.tasks)
         self.episodes = parse_episodes(config.episodes, self.suite.num_episodes)
         _check_make(self.simulator, config)
+        _check_record(config)
         self.policy = make_policy(config.policy, seed=config.seed, **config.policy_args)
 
     @property
@@ -234,7 +243,8 @@ class Evaluation:
 
     def batches(self, done: Collection[Episode] = ()) -> list[Batch]:
         """The batches that run every planned episode but those in ``done``."""
-        return plan(self.suite, self.tasks, self.episodes, num_envs=self.config.num_envs, done=done)
+        most = self.suite.max_slots if self.config.num_envs is None else self.config.num_envs
+        return plan(self.suite, self.tasks, self.episodes, num_envs=most, done=done)
 
     def run(self, store: ResultStore, on_progress: Callable[[Progress], None] = lambda progress: None) -> EvalResult:
         """Run what the store does not have yet.
@@ -407,6 +417,7 @@ class _Run:
             setup_s=placed.setup_s,
             wall_s=wall_s,
             extras=extras_of(self.policy, slot),
+            stand_ins=tuple(control.info["stand_ins"][slot]) if "stand_ins" in control.info else (),
         )
 
     def _place(self, batch: Batch) -> tuple[BatchEnv, ResetInfo]:
@@ -424,8 +435,11 @@ class _Run:
         arguments = {"tasks": list(batch.tasks), "episodes": list(batch.episodes), **_make_arguments(self.config)}
         try:
             return self.simulator.make(batch.suite, **arguments)
-        except (ValueError, KeyError) as error:
-            if type(error) is KeyError:  # a plain one is an accident; a library that means it raises its own kind
+        except AssetsMissing as error:
+            raise ConfigError(str(error)) from error
+        except (ValueError, KeyError, ImportError) as error:
+            # A plain one is an accident; a library that means it raises its own kind.
+            if type(error) in (KeyError, ImportError, ModuleNotFoundError):
                 raise
             raise ConfigError(f"{type(error).__name__}: {error}") from error
 
@@ -514,7 +528,8 @@ def _count(records: Iterable[Record]) -> dict[str, int]:
 
 def _slots(info: ResetInfo, batch: Batch) -> list[Episode]:
     """The episode in each slot, as the environment says; it must be the batch that was asked for."""
-    slots = [Episode.from_id(text) for text in info.episode_id]
+    numbers = [int(text.rsplit("/", 1)[1]) for text in info.episode_id]
+    slots = [Episode(info.suite, int(task), number) for task, number in zip(info.task_id, numbers, strict=True)]
     if sorted(slots) != sorted(batch.slots):
         raise RuntimeError(f"the environment placed {len(slots)} other episodes than the {len(batch)} asked for")
     return slots
@@ -531,6 +546,12 @@ def _check_make(simulator: Simulator, config: EvalConfig) -> None:
         inspect.signature(simulator.make).bind(config.suite, tasks=[], episodes=[], **_make_arguments(config))
     except TypeError as error:
         raise ConfigError(f"environment arguments: {error}") from None
+
+
+def _check_record(config: EvalConfig) -> None:
+    """Recordings are LIBERO's HDF5 files: they hold MuJoCo states and begin from LIBERO's init states."""
+    if (config.record or config.record_states) and config.suite.split("/")[0] == _SIMPLER:
+        raise ConfigError(f"{config.suite} cannot be recorded: recordings are in LIBERO's layout, for LIBERO's suites")
 
 
 def _git(*arguments: str, cwd: Path) -> str:

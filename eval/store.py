@@ -45,6 +45,7 @@ class Record:
         setup_s: seconds it took to place the batch (building or re-placing the environment, and reset).
         wall_s: seconds from then until this episode ended, the policy's included.
         extras: what the policy has to say about the episode, numbers and words by name.
+        stand_ins: a sentence for each file that was missing and had something plain in its place.
     """
 
     suite: str
@@ -61,6 +62,7 @@ class Record:
     setup_s: float = 0.0
     wall_s: float = 0.0
     extras: Mapping[str, Any] = field(default_factory=dict)
+    stand_ins: tuple[str, ...] = ()
 
     @property
     def key(self) -> Episode:
@@ -187,7 +189,8 @@ def _file_name(text: str) -> str:
 def _parse(line: str, where: str) -> Record:
     known = {f.name for f in fields(Record)}
     try:
-        return Record(**{key: value for key, value in json.loads(line).items() if key in known})
+        values = {key: value for key, value in json.loads(line).items() if key in known}
+        return Record(**{**values, "stand_ins": tuple(values.get("stand_ins", ()))})
     except (json.JSONDecodeError, TypeError, AttributeError) as error:
         raise StoreError(f"{where} is not an episode: {error}") from None
 

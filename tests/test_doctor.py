@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import simpler_assets_small
 from rich.console import Console
 
 from vecenv import doctor
@@ -101,6 +103,42 @@ def test_a_software_vulkan_driver_that_is_too_old_is_recognised(devices: str, ok
     check = found(doctor.diagnose(lambda source, **env: (True, devices)), "Vulkan")
     assert check.ok is ok
     assert ("too old" in check.detail) is not ok
+
+
+def test_vulkan_drivers_are_those_that_the_loader_finds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("VK_DRIVER_FILES", raising=False)
+    monkeypatch.delenv("VK_ICD_FILENAMES", raising=False)
+    monkeypatch.setattr(doctor, "ICD_FOLDERS", (str(tmp_path),))
+    none = found(doctor.diagnose(everything_answers), "Vulkan drivers")
+    assert not none.ok
+    assert str(tmp_path) in none.detail
+    assert "make system" in none.fix
+    assert "mesa-vulkan-drivers" in none.fix
+    (tmp_path / "lvp_icd.json").write_text('{"ICD": {"library_path": "/nowhere/libvulkan_lvp.so"}}')
+    (tmp_path / "odd_icd.json").write_text("{}")
+    gone = found(doctor.diagnose(everything_answers), "Vulkan drivers")
+    assert not gone.ok
+    assert "libvulkan_lvp.so, which does not exist" in gone.detail
+    assert "odd_icd.json: unreadable" in gone.detail
+    (tmp_path / "libvulkan_gpu.so").touch()
+    (tmp_path / "gpu.json").write_text('{"ICD": {"library_path": "./libvulkan_gpu.so"}}')
+    assert found(doctor.diagnose(everything_answers), "Vulkan drivers").ok
+    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "lvp_icd.json"))
+    assert not found(doctor.diagnose(everything_answers), "Vulkan drivers").ok
+
+
+def test_simplers_tree_is_an_optional_check_that_counts_stand_ins(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    name = "assets: SIMPLER meshes, pictures and robots"
+    monkeypatch.setenv("VECENV_SIMPLER_ASSETS", str(tmp_path / "none"))
+    gone = found(doctor.diagnose(everything_answers), name)
+    assert (gone.ok, gone.core) == (False, False)
+    assert "vecenv assets pull simpler" in gone.fix
+    monkeypatch.setenv("VECENV_SIMPLER_ASSETS", str(simpler_assets_small.build(tmp_path / "small")))
+    there = found(doctor.diagnose(everything_answers), name)
+    assert there.ok
+    assert "3 files are missing and have stand-ins" in there.detail
 
 
 def test_each_asset_tree_is_a_check(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,22 +1,38 @@
 """Batched robot-manipulation environments: the LIBERO and SIMPLER benchmarks behind one set of verbs.
 
-``make`` returns an environment; ``vecenv.contract`` says what it promises.
+``make`` returns an environment; ``vecenv.contract`` says what it promises. A suite's name comes in; which library
+runs it is decided here, and only that one is imported.
 """
 
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from vecenv.contract import BatchEnv
-    from vecenv.libero.suites import TaskSpec
     from vecenv.physics.budgets import Budget
     from vecenv.render.options import RenderConfig
+    from vecenv.simpler.variants import Variant
 
 __version__ = "0.1.0"
-__all__ = ["eval_metadata", "list_suites", "list_tasks", "make"]
+__all__ = ["ExtraMissing", "OptionError", "eval_metadata", "list_suites", "list_tasks", "make"]
+
+FAMILIES = ("libero", "simpler")
+_SIMPLER = "simpler"
+# What SIMPLER imports and the core does not need.
+_SIMPLER_EXTRA = ("sapien", "ruckig", "trimesh", "PIL")
+
+
+class OptionError(ValueError):
+    """An option of ``make`` that this kind of suite does not have; the message names both."""
+
+
+class ExtraMissing(ImportError):
+    """A suite needs packages that are not installed; the message has the pip command."""
 
 
 def make(
@@ -26,84 +42,174 @@ def make(
     tasks: Any = None,
     episodes: Any = None,
     backend: str = "native",
+    max_steps: int | None = None,
+    seed: int = 0,
+    num_threads: int | None = None,
     geometry: str = "exact",
     fixtures: Any = "center",
     start: str = "settled",
     settle_steps: int = 10,
-    max_steps: int = 2500,
-    seed: int = 0,
-    num_threads: int | None = None,
     num_devices: int = 1,
     budget: Budget | None = None,
     render: RenderConfig | None = None,
     scenes: str | Path | None = None,
+    gripper: str = "native",
+    overlay: str = "background",
+    shadows: bool = False,
+    variant: Variant | Mapping[str, Any] | None = None,
+    assets: str | Path | None = None,
 ) -> BatchEnv:
     """A batch of episodes: every one of ``episodes`` of every one of ``tasks``, task by task, one a slot.
 
     Args:
         suite: one of ``list_suites()``.
-        task: a single task index.
-        tasks: several task indices; all tasks of the suite when neither is given.
-        episodes: init states 0 to 49, one or several; or a mapping task -> init states. All 50 by default.
-        backend: ``"native"``: MuJoCo on CPU threads, float64. ``"warp"``: MJX on MuJoCo Warp (NVIDIA GPUs; also runs on
-            a CPU). ``"jax"``: MJX in pure JAX, any device. ``"mjx"``: warp on CUDA, jax elsewhere.
-        geometry: ``"exact"``: the collision geometry of upstream. ``"lean"``: at most 24 fitted geoms a scene.
-        fixtures: where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"`` from it
-            (a function of seed, suite, task and episode), or name -> (pos [3] or [B, 3], quat wxyz [4] or [B, 4]).
-        start: ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them (fixtures at the centre);
+        task: a single task: its index, or in SIMPLER its name.
+        tasks: several tasks; all tasks of the suite when neither is given.
+        episodes: episodes 0 to 49, one or several; or a mapping task index -> episodes. All 50 by default.
+        backend: ``"native"``: physics on the CPU, the suite's own simulator: MuJoCo on threads in float64 for LIBERO,
+            SAPIEN's PhysX in worker processes (also called ``"physx_cpu"``) for SIMPLER. LIBERO only: ``"warp"``: MJX
+            on MuJoCo Warp (NVIDIA GPUs; also runs on a CPU); ``"jax"``: MJX in pure JAX, any device; ``"mjx"``: warp on
+            CUDA, jax elsewhere.
+        max_steps: step budget in control ticks. None: 2500 (at 20 a second) in LIBERO, the task's own in SIMPLER.
+        seed: see ``fixtures``; SIMPLER's episodes depend on their number alone.
+        num_threads: threads of LIBERO's native backend, worker processes of SIMPLER; None for one a core.
+        geometry: LIBERO. ``"exact"``: the collision geometry of upstream. ``"lean"``: at most 24 fitted geoms a scene.
+        fixtures: LIBERO. Where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"``
+            from it (a function of seed, suite, task and episode), or name -> (pos [3] or [B, 3], quat wxyz [4] or
+            [B, 4]).
+        start: LIBERO. ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them (fixtures at the centre);
             ``"raw"``: init states as stored, followed by ``settle_steps``.
-        settle_steps: for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
-        max_steps: step budget in control ticks (20 a second).
-        seed: see ``fixtures``.
-        num_threads: threads of the native backend; None for one a core.
-        num_devices: devices that MJX spreads the slots over.
-        budget: contact and constraint memory on MJX; None measures each scene once and remembers it.
-        render: size and level of detail of camera images, cameras of one's own; 256 x 256 and upstream's picture by
-            default. Nothing is rendered that is not read.
-        scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and no
-            LIBERO or robosuite files are needed. Otherwise from the installed packages.
+        settle_steps: LIBERO, for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
+        num_devices: LIBERO. Devices that MJX spreads the slots over.
+        budget: LIBERO. Contact and constraint memory on MJX; None measures each scene once and remembers it.
+        render: LIBERO. Size and level of detail of camera images, cameras of one's own; 256 x 256 and upstream's
+            picture by default. Nothing is rendered that is not read.
+        scenes: LIBERO. A folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and
+            no LIBERO or robosuite files are needed. Otherwise from the installed packages.
+        gripper: SIMPLER. ``"native"``: the robot's own convention, WidowX +1 open and -1 closed, Google Robot +1 closes
+            and -1 opens; ``"binary"``: 1 closed and 0 open. ``vecenv.actions`` has the table.
+        overlay: SIMPLER. What replaces the background of pictures: ``"background"``, a photograph, as upstream's visual
+            matching does; ``"none"``; or ``"blend"``, both at one half.
+        shadows: SIMPLER. Whether lights cast shadows; upstream's do not.
+        variant: SIMPLER. What differs from visual matching's scenes (light, camera, cabinet, table, distractors): a
+            ``vecenv.simpler.variants.Variant`` or a mapping of its fields.
+        assets: SIMPLER. Root of the asset tree; None for where ``vecenv assets pull simpler`` puts it
+            (``VECENV_SIMPLER_ASSETS`` names another).
 
     Raises:
+        OptionError: an option that suites of this kind do not have.
+        ExtraMissing: SIMPLER's packages are not installed.
+        AssetsMissing: its files are not there.
         KeyError, ValueError, RuntimeError: subclasses that name the suite, task, option or asset that is wrong.
     """
+    common = {"task": task, "tasks": tasks, "episodes": episodes, "backend": backend}
+    if max_steps is not None:
+        common["max_steps"] = max_steps
+    libero = {
+        "geometry": (geometry, "exact"),
+        "fixtures": (fixtures, "center"),
+        "start": (start, "settled"),
+        "settle_steps": (settle_steps, 10),
+        "num_devices": (num_devices, 1),
+        "budget": (budget, None),
+        "render": (render, None),
+        "scenes": (scenes, None),
+    }
+    simpler = {
+        "gripper": (gripper, "native"),
+        "overlay": (overlay, "background"),
+        "shadows": (shadows, False),
+        "variant": (variant, None),
+        "assets": (assets, None),
+    }
+    if family(suite) == _SIMPLER:
+        return _make_simpler(suite, {**common, "num_workers": num_threads, **_own(suite, simpler, libero)})
+    own = _own(suite, libero, simpler)
     from vecenv.libero import env
 
-    return env.make(
-        suite,
-        task=task,
-        tasks=tasks,
-        episodes=episodes,
-        backend=backend,
-        geometry=geometry,
-        fixtures=fixtures,
-        start=start,
-        settle_steps=settle_steps,
-        max_steps=max_steps,
-        seed=seed,
-        num_threads=num_threads,
-        num_devices=num_devices,
-        budget=budget,
-        scenes=scenes,
-        **({} if render is None else {"render": render}),
-    )
+    return env.make(suite, **common, seed=seed, num_threads=num_threads, **own)
 
 
-def list_suites() -> tuple[str, ...]:
-    """Names of the suites: LIBERO's five, then LIBERO-PRO's sixteen."""
+def _own(suite: str, own: Mapping[str, tuple[Any, Any]], foreign: Mapping[str, tuple[Any, Any]]) -> dict[str, Any]:
+    """Those of a family's options that are not at their default; refuses the other family's."""
+    strange = [f"{name}={value!r}" for name, (value, default) in foreign.items() if _given(value, default)]
+    if strange:
+        raise OptionError(f"{suite} has no option {', '.join(strange)}; its own: {', '.join(own)}")
+    return {name: value for name, (value, default) in own.items() if _given(value, default)}
+
+
+def _given(value: Any, default: Any) -> bool:
+    return not (value is default or (type(value) is type(default) and value == default))
+
+
+def _make_simpler(suite: str, options: dict[str, Any]) -> BatchEnv:
+    from vecenv.simpler import tasks
+
+    tasks.list_tasks(suite)  # an unknown suite is said before anything is missed
+    missing = [name for name in _SIMPLER_EXTRA if importlib.util.find_spec(name) is None]
+    if missing:
+        needed = f"{suite} needs {', '.join(missing)}: pip install 'vecenv[simpler]'"
+        raise ExtraMissing(f"{needed} (SAPIEN's wheels are for Python 3.11 and 3.12)", name=missing[0])
+    from vecenv.simpler import env
+
+    return env.make(suite, **options)
+
+
+def family(suite: str) -> str:
+    """Which benchmark a suite belongs to by its name: ``"simpler"`` for ``simpler/...``, else ``"libero"``."""
+    return _SIMPLER if suite.split("/")[0] == _SIMPLER else "libero"
+
+
+def list_suites(family: str | None = None) -> tuple[str, ...]:
+    """Names of the suites: LIBERO's five, LIBERO-PRO's sixteen, SIMPLER's two.
+
+    Args:
+        family: ``"libero"`` (PRO's included) or ``"simpler"``; all when not given.
+
+    Raises:
+        OptionError: another family.
+    """
     from vecenv.libero import suites
+    from vecenv.simpler.tasks import SUITES
 
-    return suites.list_suites()
+    known = {"libero": suites.list_suites(), _SIMPLER: SUITES}
+    if family is None:
+        return tuple(name for names in known.values() for name in names)
+    if family not in known:
+        raise OptionError(f"family={family!r}: expected one of {', '.join(known)}, or None for all suites")
+    return known[family]
 
 
-def list_tasks(suite: str) -> tuple[TaskSpec, ...]:
-    """The tasks of a suite in upstream's order."""
+def list_tasks(suite: str) -> tuple[Any, ...]:
+    """The tasks of a suite in upstream's order, each with an ``index``, a ``name`` and an ``instruction``.
+
+    Returns:
+        ``vecenv.libero.suites.TaskSpec`` or ``vecenv.simpler.tasks.SimplerTask``, by the suite.
+
+    Raises:
+        KeyError: a subclass that lists the suites there are.
+    """
+    if family(suite) == _SIMPLER:
+        from vecenv.simpler import tasks
+
+        return tasks.list_tasks(suite)
     from vecenv.libero import suites
 
     return suites.list_tasks(suite)
 
 
 def eval_metadata(suite: str) -> dict[str, Any]:
-    """What an evaluation of a suite consists of: tasks, episodes, budget, metrics, instructions."""
+    """What an evaluation of a suite consists of: tasks, episodes, budget, metrics, instructions.
+
+    ``max_steps`` is one number in LIBERO and one a task in SIMPLER. Needs neither SAPIEN nor SIMPLER's assets.
+
+    Raises:
+        KeyError: a subclass that lists the suites there are.
+    """
+    if family(suite) == _SIMPLER:
+        from vecenv.simpler import tasks as simpler_tasks
+
+        return simpler_tasks.eval_metadata(suite)
     from vecenv.libero import suites
     from vecenv.libero.env import MAX_STEPS
 

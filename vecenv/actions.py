@@ -1,19 +1,28 @@
 """Whatever a caller calls an action becomes a validated array; every convention about actions is on this page.
 
-========  =========================================================  =======================================
-space     one action                                                 gripper
-========  =========================================================  =======================================
-7-vector  dx dy dz, axis-angle rotation, gripper, each in [-1, 1]    +1 closes, -1 opens (LIBERO)
-8-vector  x y z in metres, qw qx qy qz, grip: absolute world pose    1 closed, 0 open
-========  =========================================================  =======================================
+``step_continuous`` takes 7-vectors: a translation, a rotation as axis-angle vector, a gripper command. What the numbers
+mean is the suite's:
 
-For LIBERO a translation of 1 is 0.05 m and a rotation of 1 is 0.5 rad, relative to the current pose, world frame.
+====================  =============  ===========  ==========================  =======================================
+suite                 translation    rotation     relative to                 gripper
+====================  =============  ===========  ==========================  =======================================
+LIBERO                1 is 0.05 m    1 is 0.5     current pose, world axes    +1 closes, -1 opens; by its sign
+simpler/bridge        metres         radians      last target, base axes      +1 open, -1 closed; absolute
+simpler/google_robot  metres         radians      measured pose, base axes    added: +1 closes, -1 opens, 0 stays
+====================  =============  ===========  ==========================  =======================================
+
+Values are clipped: LIBERO's to 1, SIMPLER's to 1 m, pi/2 and 1. ``vecenv.make(..., gripper="binary")`` makes the
+gripper column of SIMPLER's suites 1 closed and 0 open (above or below one half), whichever robot it is, as the
+benchmark's seeds describe it. ``GRIPPER`` is the column as data. ``step_ee_pose`` and ``step_waypoints`` speak one
+language in all suites: xyz in metres and wxyz, absolute, world frame, grip 1 closed and 0 open.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,6 +32,31 @@ from vecenv.controllers.waypoint import Plan, Pose
 
 _NO_LENGTH = 1e-6
 _MOST_STEPS = 2**31 - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class GripperColumn:
+    """What the last column of a 7-vector says.
+
+    Attributes:
+        closed, open: values that close and open the gripper.
+        relative: values are added to the last command, so that 0 leaves it as it is.
+    """
+
+    closed: float
+    open: float
+    relative: bool = False
+
+
+GRIPPER: Mapping[str, GripperColumn] = MappingProxyType(
+    {
+        "libero": GripperColumn(closed=1.0, open=-1.0),
+        "simpler/bridge": GripperColumn(closed=-1.0, open=1.0),
+        "simpler/google_robot": GripperColumn(closed=1.0, open=-1.0, relative=True),
+        "binary": GripperColumn(closed=1.0, open=0.0),
+    }
+)
+"""The gripper column of LIBERO's suites, of each of SIMPLER's, and of SIMPLER's option ``gripper="binary"``."""
 
 
 class ActionError(ValueError):
@@ -44,15 +78,16 @@ def _array(value: Any, what: str, right: str) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def continuous(value: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray]:
+def continuous(value: Any, num_envs: int, limits: Any = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Validate the input of ``step_continuous``.
 
     Args:
         value: [B, 7] or a chunk [B, K, 7], as an array, nested lists or JSON text; with B = 1 also [7].
         num_envs: B.
+        limits: largest absolute values, one number or [7].
 
     Returns:
-        float64 actions [B, K, 7], finite and within [-1, 1]; and which slots had to be mended, bool [B].
+        float64 actions [B, K, 7], finite and within the limits; and which slots had to be mended, bool [B].
 
     Raises:
         ActionError: the wrong shape or not numbers.
@@ -66,7 +101,8 @@ def continuous(value: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray]:
         array = array[:, None]
     if array.ndim != 3 or array.shape[0] != num_envs or array.shape[2] != ACTION_DIM:
         raise ActionError(f"actions: got shape {shape}; expected {right}")
-    mended = np.clip(np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0), -1.0, 1.0)
+    most = np.asarray(limits, float)
+    mended = np.clip(np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0), -most, most)
     return mended, (mended != array).any(axis=(1, 2))
 
 

@@ -78,7 +78,8 @@ def list_command(
     suites = tuple(vecenv.list_suites())
     if suite and suite not in suites:
         fail(unknown("suite", suite, suites))
-    rows = _task_rows(vecenv.list_tasks(suite)) if suite else _suite_rows(suites)
+    named = vecenv.family(suite) == "simpler"
+    rows = _task_rows(vecenv.list_tasks(suite), named) if suite else _suite_rows(suites)
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
     else:
@@ -87,10 +88,12 @@ def list_command(
 
 def compile_command(
     out: Path = typer.Option(..., "--out", metavar="DIR", help="Folder to write; make(..., scenes=DIR) reads it."),
-    suite: list[str] = typer.Option([], "--suite", help="A suite to export; may be given again. All by default."),
+    suite: list[str] = typer.Option(
+        [], "--suite", help="A LIBERO suite to export; may be given again. All by default."
+    ),
     geometry: list[str] = typer.Option(["exact"], "--geometry", help="exact or lean; may be given again."),
 ) -> None:
-    """Export suites into one folder that needs no LIBERO or robosuite files: tasks, starts and compiled scenes."""
+    """Export LIBERO suites into one folder that needs no LIBERO or robosuite files: tasks, starts, compiled scenes."""
     from rich.console import Console
     from rich.progress import track
 
@@ -103,8 +106,8 @@ def compile_command(
     from vecenv.libero.suites import TaskDataError
 
     for name in suite:
-        if name not in vecenv.list_suites():
-            fail(unknown("suite", name, vecenv.list_suites()))
+        if name not in vecenv.list_suites("libero"):
+            fail(unknown("suite", name, vecenv.list_suites("libero")))
     for name in geometry:
         if name not in PROFILES:
             fail(unknown("geometry", name, PROFILES))
@@ -139,7 +142,7 @@ def _version(wanted: bool) -> None:
 def _root(
     version: bool = typer.Option(False, "--version", help="Print the version.", is_eager=True, callback=_version),
 ) -> None:
-    """Batched robot-manipulation environments: LIBERO on MuJoCo, and an evaluation harness."""
+    """Batched robot-manipulation environments: LIBERO on MuJoCo, SIMPLER on SAPIEN, and an evaluation harness."""
 
 
 def _mount(app: typer.Typer, plugin: importlib.metadata.EntryPoint) -> None:
@@ -170,8 +173,12 @@ def _suite_rows(suites: Iterable[str]) -> list[dict[str, Any]]:
     return [{"suite": suite, "tasks": len(vecenv.list_tasks(suite))} for suite in suites]
 
 
-def _task_rows(tasks: Iterable[Any]) -> list[dict[str, Any]]:
-    return [{"task": i, "instruction": task.instruction} for i, task in enumerate(tasks)]
+def _task_rows(tasks: Iterable[Any], named: bool) -> list[dict[str, Any]]:
+    """LIBERO's names are its instructions, nearly; SIMPLER's are how its tasks are known."""
+    return [
+        {"task": i, **({"name": task.name} if named else {}), "instruction": task.instruction}
+        for i, task in enumerate(tasks)
+    ]
 
 
 def _print_rows(rows: list[dict[str, Any]]) -> None:

@@ -18,7 +18,7 @@ import sys
 import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,11 @@ from rich.table import Column, Table
 from vecenv.machine import usable_cores
 
 DISTRIBUTION = "vecenv"
+# What installs the system's libraries from a clone.
+SYSTEM_COMMAND = "make system"
+# Where the Vulkan loader looks for drivers, unless one of these variables names files.
+ICD_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+ICD_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
 # Distributions worth naming although no requirement of ours names them.
 ALSO_SHOWN = ("jaxlib", "robosuite")
 # Extras that collect other extras: "all" is not shown, "dev" is shown for what only it asks for.
@@ -83,6 +88,11 @@ import sapien
 sapien.render.RenderMaterial()
 print(f"SAPIEN {sapien.__version__} finds a device to draw with")
 """
+
+_MESA_FIX = (
+    f"{SYSTEM_COMMAND}, or apt-get install libvulkan1 mesa-vulkan-drivers (24.3 or newer: bookworm-backports), "
+    "or your GPU's driver"
+)
 
 _JAX_PROBE = """
 import jax
@@ -211,6 +221,7 @@ def diagnose(run_probe: Callable[..., tuple[bool, str]] | None = None) -> Report
         *_package_checks(rows),
         _jax_check(run_probe),
         *_gl_checks(run_probe),
+        _icd_check(),
         _vulkan_check(run_probe),
         *_sapien_checks(run_probe),
         *_asset_checks(),
@@ -311,7 +322,7 @@ def _gl_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
     checks = []
     for backend, wanted in debian.items():
         ok, text = run_probe(_GL_PROBE, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
-        fix = "" if ok else f"apt-get install {wanted} (Debian, Ubuntu), or your GPU's driver"
+        fix = "" if ok else f"{SYSTEM_COMMAND}, or apt-get install {wanted} (Debian, Ubuntu), or your GPU's driver"
         checks.append(Check(f"GL: {backend}", ok, False, text, fix))
     return [*checks, _images_check(dict(zip(debian, checks, strict=True)))]
 
@@ -331,14 +342,37 @@ def _images_check(gl: dict[str, Check]) -> Check:
     return Check("camera images", True, False, f"drawn with {chosen}{how} ({why})")
 
 
+def _icd_check() -> Check:
+    """The Vulkan drivers that are installed: files that tell the loader where a driver's library is."""
+    named = next((os.environ[name] for name in ICD_VARIABLES if os.environ.get(name)), None)
+    folders = [Path(folder) for folder in ICD_FOLDERS if Path(folder).is_dir()]
+    files = (
+        [Path(text) for text in named.split(os.pathsep)] if named else [p for f in folders for p in f.glob("*.json")]
+    )
+    drivers = [_driver(path) for path in files]
+    if not drivers:
+        return Check("Vulkan drivers", False, False, f"none in {', '.join(ICD_FOLDERS)}", _MESA_FIX)
+    ok = any(there for _, there in drivers)
+    return Check("Vulkan drivers", ok, False, "; ".join(text for text, _ in drivers), "" if ok else _MESA_FIX)
+
+
+def _driver(path: Path) -> tuple[str, bool]:
+    """What a driver's file says, and whether its library can be there: a name alone is looked up by the linker."""
+    try:
+        library = str(json.loads(path.read_text())["ICD"]["library_path"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        return f"{path}: unreadable ({type(error).__name__})", False
+    there = "/" not in library or (path.parent / library).exists()
+    return f"{path.name}: {library}{'' if there else ', which does not exist'}", there
+
+
 def _vulkan_check(run_probe: Callable[..., tuple[bool, str]]) -> Check:
     """Vulkan: SAPIEN draws with it. It finds no device in Mesa's software driver before 24.3 (measured with 22.3)."""
     ok, text = run_probe(_VULKAN_PROBE)
     devices = text.splitlines()
     if ok and all(map(_mesa_too_old, devices)):
         ok, devices = False, [f"{device}: too old, SAPIEN sees no device before Mesa 24.3" for device in devices]
-    fix = "apt-get install libvulkan1 mesa-vulkan-drivers (24.3 or newer: bookworm-backports), or your GPU's driver"
-    return Check("Vulkan", ok, False, "; ".join(devices), "" if ok else fix)
+    return Check("Vulkan", ok, False, "; ".join(devices), "" if ok else _MESA_FIX)
 
 
 def _sapien_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
@@ -362,7 +396,17 @@ def _asset_checks() -> list[Check]:
         rows: Iterable[Any] = importlib.import_module(f"{DISTRIBUTION}.assets").asset_report()
     except Exception as error:  # a broken asset tree must not take the report down
         return [Check("assets", False, True, _one_line(error), _install_command())]
-    return [_asset_check(row) for row in rows]
+    return [*(_asset_check(row) for row in rows), _simpler_asset_check()]
+
+
+def _simpler_asset_check() -> Check:
+    """SIMPLER's tree, which only its own suites need, and how many of its files something plain stands in for."""
+    assets: Any = importlib.import_module(f"{DISTRIBUTION}.simpler.assets")
+    row = assets.asset_row()
+    check = _asset_check(row)
+    notes = assets.stand_ins(row.path) if row.ok else ()
+    detail = f"{check.detail}; {len(notes)} files are missing and have stand-ins" if notes else check.detail
+    return replace(check, core=False, detail=detail)
 
 
 def _asset_check(row: Any) -> Check:

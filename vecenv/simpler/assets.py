@@ -153,17 +153,17 @@ def default_root() -> Path:
     return Path(named).expanduser() if named else platformdirs.user_data_path("vecenv") / "simpler"
 
 
-def simpler_root() -> Path:
-    """Root of the tree.
+def simpler_root(given: str | Path | None = None) -> Path:
+    """Root of the tree: ``given``, or ``default_root()``.
 
     Raises:
         AssetsMissing: there is none.
     """
-    root = default_root()
+    root = default_root() if given is None else Path(given).expanduser()
     absent = [marker for marker in _MARKERS if not (root / marker).is_dir()]
     if not absent:
         return root
-    where = f"{VARIABLE}={str(root)!r}" if os.environ.get(VARIABLE) else str(root)
+    where = f"{VARIABLE}={str(root)!r}" if given is None and os.environ.get(VARIABLE) else str(root)
     problem = f"{where} has no {absent[0]}" if root.is_dir() else f"{where} is not a directory"
     fix = f"{HOW_TO_GET}, or point {VARIABLE} at a folder with {' and '.join(_MARKERS)}"
     raise AssetsMissing(NAME, problem, fix)

@@ -5,14 +5,12 @@ A batch of slots, each with one episode of one task of ``simpler/bridge`` (Widow
 ``scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so actions of the whole
 batch become set-points in one call; scenes are stepped one by one, spread over worker processes.
 
-An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in the axes of the robot's base. It is
-clipped to 1 m, pi/2 rad and 1. The gripper's convention is the robot's own: WidowX takes +1 as open and -1 as closed,
-absolute; the Google Robot adds, +1 closes further, -1 opens further, 0 stays.
+An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in the axes of the robot's base;
+``vecenv/actions.py`` has the table of conventions.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -44,12 +42,20 @@ from vecenv.simpler.layouts import episode_layout, episode_seed
 from vecenv.simpler.scenes import instances
 from vecenv.simpler.servo import Servo, ServoConfig
 from vecenv.simpler.tasks import NUM_EPISODES, SimplerTask, find_task, list_tasks
+from vecenv.simpler.variants import Variant, make_variant, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 
 if TYPE_CHECKING:
     from vecenv.simpler.overlay import Painter, Picture
 
 BACKENDS = ("physx_cpu",)
+# What ``vecenv.make`` calls a suite's own CPU physics.
+_NATIVE = "native"
+_NO_CUDA = (
+    "backend='physx_cuda' is not supported: SIMPLER runs on backend='physx_cpu' (the default, also called 'native'), "
+    "spread over processes by num_threads. SAPIEN's GPU physics needs a PhysX library that is no part of its wheel, "
+    "and vecenv's scenes, controllers and criteria have not been written or tested for it; a GPU does draw the pictures"
+)
 GRIPPERS = ("native", "binary")
 OVERLAYS = ("background", "none", "blend")
 # Largest action: metres, radians, gripper.
@@ -71,7 +77,7 @@ class SimplerConfig:
     """Options of a SIMPLER batch.
 
     Attributes:
-        backend: ``"physx_cpu"``.
+        backend: ``"physx_cpu"``, also called ``"native"``; ``"physx_cuda"`` is not supported, and says so.
         num_workers: processes that scenes are spread over; 1 steps them in this one. None: one a core, and no more
             than slots.
         gripper: ``"native"``, the robot's own convention; or ``"binary"``, 1 closed and 0 open (above or below one
@@ -81,6 +87,7 @@ class SimplerConfig:
         overlay: what replaces the background of pictures: ``"background"``, a photograph, as upstream's visual matching
             does; ``"none"``; or ``"blend"``, both at one half.
         shadows: whether lights cast shadows; upstream's do not.
+        variant: what is different from visual matching's scenes; None for nothing.
         assets: root of the asset tree; None for where ``vecenv assets pull simpler`` puts it.
     """
 
@@ -91,9 +98,14 @@ class SimplerConfig:
     servo: ServoConfig | None = None
     overlay: str = "background"
     shadows: bool = False
+    variant: Variant | None = None
     assets: Path | None = None
 
     def __post_init__(self) -> None:
+        if self.backend == "physx_cuda":
+            raise SimplerError(_NO_CUDA)
+        if self.backend == _NATIVE:
+            object.__setattr__(self, "backend", BACKENDS[0])
         for name, allowed in (("backend", BACKENDS), ("gripper", GRIPPERS), ("overlay", OVERLAYS)):
             if getattr(self, name) not in allowed:
                 raise SimplerError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
@@ -120,7 +132,7 @@ class SimplerEnv:
         self.num_envs = len(placement)
         self.tasks = list_tasks(suite)
         self.robot = self.tasks[0].robot
-        self._root = config.assets or assets.simpler_root()
+        self._root = assets.simpler_root(config.assets)
         self._controller = robots.controller(self.robot, self._root / self.robot.urdf_path(), self.num_envs)
         self._servo = Servo(self._controller, config.servo or ServoConfig.of(self.robot))
         self._slots: Slots | None = make_slots(self._sizes(), self._num_workers())
@@ -176,7 +188,8 @@ class SimplerEnv:
     def _episode(self, task: int, episode: int) -> Episode:
         key, chosen = (task, episode), self.tasks[task]
         if key not in self._prepared:
-            self._prepared[key] = prepare(chosen, episode_layout(chosen, episode_seed(episode)), self._root)
+            layout = episode_layout(chosen, episode_seed(episode))
+            self._prepared[key] = prepare(*varied(chosen, layout, self.config.variant), self._root)
         return self._prepared[key]
 
     def reset(self) -> ResetInfo:
@@ -264,7 +277,7 @@ class SimplerEnv:
             ActionError: not numbers, or another shape.
         """
         self._check_live()
-        chunk, mended = validated(actions, self.num_envs)
+        chunk, mended = action_space.continuous(actions, self.num_envs, ACTION_LIMITS)
         chunk[..., 6] = self._native_gripper(chunk[..., 6])
         self._servo.forget(np.ones(self.num_envs, bool))
         before, reward = self._steps.copy(), np.zeros(self.num_envs)
@@ -677,18 +690,6 @@ class _Followed:
                 self._at[row] += 1
 
 
-def validated(actions: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray]:
-    """Actions [B, K, 7], finite and within ``ACTION_LIMITS``, and which slots had to be mended, bool [B].
-
-    Raises:
-        ActionError: the wrong shape or not numbers.
-    """
-    shape = action_space.continuous(actions, num_envs)[0].shape
-    raw = np.array(json.loads(actions) if isinstance(actions, str) else actions, float).reshape(shape)
-    mended = np.clip(np.nan_to_num(raw, nan=0.0, posinf=0.0, neginf=0.0), -ACTION_LIMITS, ACTION_LIMITS)
-    return mended, (mended != raw).any(axis=(1, 2))
-
-
 def task_indices(suite: str, tasks: Any) -> Any:
     """Indices of tasks given by name, index, or several of either; None stays None."""
     if tasks is None or isinstance(tasks, Mapping):
@@ -716,4 +717,7 @@ def make(suite: str, *, task: Any = None, tasks: Any = None, episodes: Any = Non
         num_tasks=len(known),
         num_episodes=NUM_EPISODES,
     )
-    return SimplerEnv(suite, placement, SimplerConfig(**options))
+    tree = options.pop("assets", None)
+    chosen_variant = make_variant(options.pop("variant", None))
+    config = SimplerConfig(assets=Path(tree) if tree else None, variant=chosen_variant, **options)
+    return SimplerEnv(suite, placement, config)
