@@ -39,7 +39,9 @@ def eval_command(
         None, help="Suite to evaluate; `vecenv list` names them.", show_default="required"
     ),
     policy: str | None = typer.Option(
-        None, help="random, zero, pick_place, voxposer, or your own module:Class.", show_default="pick_place"
+        None,
+        help="random, zero, voxposer, pick_place (LIBERO), simpler_scripted, or your own module:Class.",
+        show_default="the suite's scripted one",
     ),
     tasks: str | None = typer.Option(None, help="all, or indices, ranges and names: 0,3,5-7.", show_default="all"),
     episodes: str | None = typer.Option(None, help="all, a count, or indices and ranges: 0,3,5-7.", show_default="all"),
@@ -144,12 +146,13 @@ def _print_replay(console: Console, report: ReplayReport) -> None:
 
 def _start(arguments: dict[str, Any], out: Path | None) -> tuple[Evaluation, ResultStore]:
     """A new evaluation; no folder is made before the arguments are known to make sense."""
-    from eval.runner import EvalConfig, Evaluation, begin
+    from eval.runner import EvalConfig, Evaluation, begin, default_policy
     from eval.store import default_folder
 
     if not arguments["suite"]:
         fail("--suite is needed; `vecenv list` names the suites (or --resume goes on with a results folder)")
-    config = EvalConfig(**{key: value for key, value in arguments.items() if value is not None})
+    arguments = {"policy": default_policy(arguments["suite"])} | {k: v for k, v in arguments.items() if v is not None}
+    config = EvalConfig(**arguments)
     evaluation = Evaluation(config)
     return evaluation, begin(config, out or default_folder(RESULTS, config.suite, config.policy))
 

@@ -32,6 +32,8 @@ from vecenv.contract import BatchEnv, Control, Metrics, ResetInfo
 # Called with which slots have just finished, bool [B], with the verdicts, bool [B], and with the faults, B strings.
 _Finish: TypeAlias = Callable[[np.ndarray, np.ndarray, Sequence[str]], None]
 _SIMPLER = "simpler"
+# Policies that know a benchmark's scenes, each of another.
+_SCRIPTED = ("pick_place", "simpler_scripted")
 # A slot of SIMPLER is a PhysX scene of its own.
 _SIMPLER_SLOTS = 50
 # Calls of a policy in a row that may leave every live slot where it was, before it counts as stuck.
@@ -234,6 +236,7 @@ class Evaluation:
         self.episodes = parse_episodes(config.episodes, self.suite.num_episodes)
         _check_make(self.simulator, config)
         _check_record(config)
+        _check_policy(config)
         self.policy = make_policy(config.policy, seed=config.seed, **config.policy_args)
 
     @property
@@ -546,6 +549,22 @@ def _check_make(simulator: Simulator, config: EvalConfig) -> None:
         inspect.signature(simulator.make).bind(config.suite, tasks=[], episodes=[], **_make_arguments(config))
     except TypeError as error:
         raise ConfigError(f"environment arguments: {error}") from None
+
+
+def default_policy(suite: str) -> str:
+    """The scripted policy that is made for a suite."""
+    return "simpler_scripted" if suite.split("/")[0] == _SIMPLER else "pick_place"
+
+
+def _check_policy(config: EvalConfig) -> None:
+    """The built-in policies that are made for certain suites do not run on others, where they could only fail."""
+    if config.policy in _SCRIPTED and config.policy != default_policy(config.suite):
+        ours = default_policy(config.suite)
+        raise ConfigError(
+            f"policy {config.policy!r} is not made for {config.suite}; the scripted one there is {ours!r}"
+        )
+    if config.policy == "voxposer" and config.suite == "simpler/google_robot":
+        raise ConfigError("policy 'voxposer' knows Panda's and WidowX's hands, not the Google Robot's")
 
 
 def _check_record(config: EvalConfig) -> None:

@@ -107,3 +107,11 @@ def test_every_plan_covers_each_missing_episode_once_within_the_slots(data: st.D
     placed = [slot for batch in batches for slot in batch.slots]
     assert sorted(placed) == sorted(set(everything) - done)
     assert all(0 < len(batch) <= num_envs for batch in batches)
+
+
+def test_tasks_may_be_asked_for_by_name() -> None:
+    names = ("stack_cube", "open_drawer", "0-1")
+    assert parse_tasks("open_drawer, 0", 3, names) == (1, 0)
+    assert parse_tasks("0-1", 3, names) == (2,)
+    with pytest.raises(SpecError, match=r"cannot read 'stack_cub' as tasks.*did you mean stack_cube"):
+        parse_tasks("stack_cub", 3, names)

@@ -57,7 +57,7 @@ def test_distractors_lie_beside_the_can(kind: str, episode: int) -> None:
     _, layout = under(COKE, episode, distractors=kind)
     can, *others = layout.objects
     assert [placed.model for placed in others] == list(DISTRACTORS[kind])
-    assert {placed.role for placed in others} == {"other"}
+    assert {placed.role for placed in others} == {"distractor"}
     for placed in others:
         assert np.hypot(placed.position[0] - can.position[0], placed.position[1] - can.position[1]) > 0.25
         assert -0.5 <= placed.position[0] <= -0.1
@@ -129,5 +129,29 @@ def test_a_variant_whose_file_is_missing_names_the_file(small: Path) -> None:
     stage = "google_pick_coke_can_1_v4_alt_background"
     with pytest.raises(AssetsMissing, match=f"{stage}.glb"):
         vecenv.make(GOOGLE, task=COKE, episodes=[0], assets=small, num_threads=1, variant={"stage": stage})
+    station = small / "data/custom/mk_station3.urdf"
+    station.write_text(
+        (small / "data/custom/mk_station_recolor.urdf")
+        .read_text()
+        .replace("</link>", '<visual><geometry><mesh filename="models/stone.glb"/></geometry></visual></link>', 1)
+    )
+    with pytest.raises(AssetsMissing, match=r"no data/custom/models/stone.glb, a part of mk_station3.urdf"):
+        vecenv.make(GOOGLE, task=OPEN, episodes=[0], assets=small, variant={"station": "mk_station3"})
     with pytest.raises(VariantError, match="'sun' is none of lighting, camera"):
         vecenv.make(GOOGLE, task=COKE, episodes=[0], assets=small, variant={"sun": "high"})
+
+
+def test_distractors_fall_after_the_can_and_do_not_move_it(small: Path) -> None:
+    pytest.importorskip("sapien")
+    poses = []
+    for variant in (None, {"distractors": "less"}):
+        env = vecenv.make(GOOGLE, task=COKE, episodes=[0, 3], assets=small, num_threads=1, variant=variant)
+        env.reset()
+        snapshots = env.observe_objects().snapshot
+        assert all(snapshot is not None for snapshot in snapshots)
+        poses.append([snapshot.poses for snapshot in snapshots if snapshot is not None])
+        env.close()
+    for alone, crowded in zip(*poses, strict=True):
+        np.testing.assert_allclose(crowded["opened_coke_can"], alone["opened_coke_can"], atol=1e-4)
+        assert set(crowded) == {"opened_coke_can", *DISTRACTORS["less"]}
+        assert all(pose[2] > 0.85 for pose in crowded.values())

@@ -171,6 +171,12 @@ class Agent:
             return self._book(self._wait())
         return self._book(self._follow(plans.stack(rows, self.config.plan)))
 
+    def close(self) -> None:
+        """Let go of snapshots and maps; nothing can be planned afterwards."""
+        for slot in self.slots:
+            slot.queue, slot.pushing = [], None
+            slot.interface.end()
+
     # -- one slot's subtask --------------------------------------------------------------------------------------------
 
     def _ask(self, slot: Slot, snapshot: ObjectsSnapshot | None) -> None:
@@ -188,7 +194,7 @@ class Agent:
                 slot.cursor += 1
                 slot.done_subtasks += 1
                 slot.lmps.composer(slot.last)
-                slot.queue = list(slot.interface.requests)
+                slot.queue = slot.interface.taken()
         except (HostFault, PerceptionError, InterfaceError) as error:
             self._give_up(slot, error)
 
@@ -243,7 +249,7 @@ class Agent:
         """The hand counts as being where it is, no longer at the end of what programs asked for."""
         if slot.queue:
             ee = slot.interface.perception.snapshot.ee_pose
-            slot.interface.perception.move_hand(ee[:3], matrix(ee[3:]))
+            slot.interface.perception.move_hand(ee[:3], matrix(ee[3:]), closed=slot.closed)
 
     def _plan_pushes(self, slots: Sequence[int], rows: list[list[Row]]) -> None:
         """The next push of every slot that pushes, found for all in one call."""
@@ -283,7 +289,7 @@ class Agent:
                 Planned(self.slots.index(slot), number, slot.last, request, perception, path, tuple(stops))
             )
         rows, slot.closed = plans.expand_flips(stops, slot.closed, slot.done_subtasks - 1, self.config.plan)
-        slot.interface.perception.move_hand(stops[-1].pos, matrix(stops[-1].quat))
+        slot.interface.perception.move_hand(stops[-1].pos, matrix(stops[-1].quat), closed=slot.closed)
         return rows
 
     def _stops(self, slot: Slot, request: Request, path: np.ndarray) -> list[Stop]:

@@ -28,6 +28,8 @@ class Gripper:
         pad: lower and upper edge of the pads, relative to the grip site.
         palm: height of the palm's underside above the grip site.
         palm_half: half extents of the palm along and across the closing direction.
+        wrist: height of the wrist's underside above the grip site; infinite leaves the wrist out of account.
+        wrist_half: half extents of the wrist along and across the closing direction.
     """
 
     half_opening: float = 0.0385
@@ -37,6 +39,8 @@ class Gripper:
     pad: tuple[float, float] = (-0.0044, 0.0116)
     palm: float = 0.031
     palm_half: tuple[float, float] = (0.104, 0.032)
+    wrist: float = np.inf
+    wrist_half: tuple[float, float] = (0.060, 0.100)
 
     def narrowed(self, half_opening: float) -> Gripper:
         """The same gripper with its fingers partly closed."""
@@ -230,8 +234,8 @@ def clearance(grasps: Grasps, obstacles: np.ndarray, gripper: Gripper = Gripper(
         gripper: the gripper.
 
     Returns:
-        Smallest distance (largest coordinate difference) of an obstacle from the space that the open fingers and the
-        palm sweep, metres, negative inside, [K]; infinite without obstacles.
+        Smallest distance (largest coordinate difference) of an obstacle from the space that the open fingers, the palm
+        and the wrist sweep, metres, negative inside, [K]; infinite without obstacles.
     """
     if not len(obstacles) or not len(grasps):
         return np.full(len(grasps), np.inf)
@@ -242,4 +246,37 @@ def clearance(grasps: Grasps, obstacles: np.ndarray, gripper: Gripper = Gripper(
     finger = np.maximum(finger, -gripper.tip - h)
     palm = np.maximum(along - gripper.palm_half[0], across - gripper.palm_half[1])
     palm = np.maximum(palm, gripper.palm - h)
-    return np.minimum(finger, palm).min(axis=1)
+    wrist = np.maximum(along - gripper.wrist_half[0], across - gripper.wrist_half[1])
+    wrist = np.maximum(wrist, gripper.wrist - h)
+    return np.minimum(np.minimum(finger, palm), wrist).min(axis=1)
+
+
+def room_around(
+    pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gripper: Gripper = Gripper(), *, reach: float = 0.28
+) -> float:
+    """Room around the open hand where it is, whichever way it points.
+
+    Args:
+        pos: of the grip site, [3].
+        rotation: of the hand, [3, 3]: the second column is the closing direction, the third points out of the palm.
+        obstacles: points it must not touch, [N, 3].
+        gripper: the gripper.
+        reach: of the hand and wrist behind the grip site, metres.
+
+    Returns:
+        Smallest distance (largest coordinate difference) of an obstacle from fingers, palm and wrist, metres, negative
+        inside; infinite without obstacles.
+    """
+    if not len(obstacles):
+        return np.inf
+    local = (obstacles - pos) @ rotation
+    across, along, back = np.abs(local[:, 0]), np.abs(local[:, 1]), -local[:, 2]
+    boxes = (
+        (gripper.half_reach, gripper.finger_half_width, -gripper.tip, gripper.palm),
+        (*gripper.palm_half, gripper.palm, min(gripper.wrist, reach)),
+        (*gripper.wrist_half, gripper.wrist, reach),
+    )
+    apart = [
+        np.maximum.reduce([along - half, across - side, low - back, back - high]) for half, side, low, high in boxes
+    ]
+    return float(np.min(apart))

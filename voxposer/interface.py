@@ -103,6 +103,15 @@ class Interface:
         self._perception, self._closed = perception, perception.hand.closed
         self.requests = []
 
+    def taken(self) -> list[Request]:
+        """What was asked for since the last call; its maps are large and no longer kept here."""
+        requests, self.requests = self.requests, []
+        return requests
+
+    def end(self) -> None:
+        """Let go of snapshot and maps."""
+        self._perception, self.requests = None, []
+
     @property
     def perception(self) -> Perception:
         """What is seen now."""

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 from voxposer.offline_grammar import Action, Noun, Place, Relation, read_instruction, read_noun, side_said
 from voxposer.offline_words import Name, NotUnderstood, matching, read_names
 
-# Distances spoken of in subtasks, centimetres: over a target before the last descent; after grasping and releasing;
-# the way of a drawer, which stops at its end by itself; a step of a door; room kept from what is to be avoided.
-ABOVE, LIFT, DRAWER, SHUT, DOOR, AVOID = 10, 10, 18, 22, 10, 15
+# Distances spoken of in subtasks, centimetres: over a target before the last descent; before a target that is entered
+# from a side; after grasping and releasing; the way of a drawer, which stops at its end by itself; a step of a door;
+# room kept from what is to be avoided.
+ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID = 10, 20, 10, 18, 22, 10, 15
 # Steps that take a door through its range.
 DOOR_STEPS = 6
 _SPEEDS = {"slowly": 0.5, "carefully": 0.5, "gently": 0.5, "quickly": 1.5, "fast": 1.5}
@@ -237,12 +238,12 @@ def _lowered(relation: str, place: str) -> list[str]:
         return [f"move to {ABOVE}cm above the table {goal}", f"place it {goal}", *_LEAVE]
     word = "in" if relation == "in" else "on"
     if place.endswith(("_inside", "_level")):
-        return [f"move to {ABOVE}cm in front of {place}", f"place it {word} {place}", *_back_from(place)]
+        return [f"move to {BEFORE}cm in front of {place}", f"place it {word} {place}", *_back_from(place, BEFORE)]
     return [f"move to {ABOVE}cm above {place}", f"place it {word} {place}", *_LEAVE]
 
 
-def _back_from(handle: str) -> list[str]:
-    return [f"move back from {handle} by {ABOVE}cm", "back to default pose"]
+def _back_from(handle: str, cm: int = ABOVE) -> list[str]:
+    return [f"move back from {handle} by {cm}cm", "back to default pose"]
 
 
 def _place_thing(place: Place, names: Sequence[Name]) -> Found:

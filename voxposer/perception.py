@@ -20,10 +20,10 @@ import numpy as np
 
 from vecenv.contract import ObjectsSnapshot, Part, PointCloud, RegionBox
 from voxposer import maps
-from voxposer.grasps import Grasps, clearance
+from voxposer.grasps import Grasps, Gripper, clearance, room_around
 from voxposer.lmp import Observation
 from voxposer.placing import Target, choose_grasp, put_down
-from voxposer.world import HOME_ROTATION, Margins, World, down_facing, matrix, spun, upright, yaw
+from voxposer.world import Margins, World, down_facing, matrix, pinching, spun, tilted, upright, yaw
 
 MAP_SIZE = 100
 
@@ -49,7 +49,11 @@ class PerceptionConfig:
         closed_gap: fingers that were told to close and stay further apart than this hold something.
         bar_depth: how deep the bar of a handle is at most.
         tilts: of the hand from the vertical, tried at a handle, steepest first, radians.
-        push_tilt: of the hand from the vertical while it pushes a part shut, radians.
+        push_tilts: of the hand from the vertical while it pushes a part shut, best first, radians.
+        less_tilt: room that each step down that list must gain, metres.
+        push_start: how far before a part such a push begins.
+        wrist_back: how far behind the grip site the wrist is.
+        nearest: a wrist closer than this to the robot's base, horizontally, is out of reach.
         handle_room: room that suffices around the hand at a handle.
         table_margin: share of the workspace left out at each side of the table.
         above: how far over a thing the hand goes when it has nothing to put down.
@@ -57,12 +61,16 @@ class PerceptionConfig:
         home_reach: how far the hand is before the robot's base when an episode begins.
     """
 
-    margins: Margins = field(default_factory=Margins)
+    margins: Margins = field(default_factory=lambda: Margins(gripper=Gripper(wrist=0.14), grasp_tilts=(0.3, 0.6)))
     held_box: tuple[float, float, float] = (0.020, 0.006, 0.022)
     closed_gap: float = 0.0015
     bar_depth: float = 0.017
     tilts: tuple[float, ...] = (np.pi / 4, np.pi / 3, 1.4)
-    push_tilt: float = np.pi / 4
+    push_tilts: tuple[float, ...] = (np.pi / 4, 0.6, 0.4, 0.2, 0.0)
+    less_tilt: float = 0.01
+    push_start: float = 0.08
+    wrist_back: float = 0.2
+    nearest: float = 0.30
     handle_room: float = 0.0
     table_margin: float = 0.1
     above: float = 0.10
@@ -153,6 +161,7 @@ class Perception:
         world: the snapshot as grasping and placing see it.
         exact: voxel -> the world position [3] that it was rounded from, for every grasp and place handed out.
         targets: voxel -> name of the thing that a grasp handed out there is meant for.
+        closed: whether the hand counts as closed where it counts as being.
     """
 
     def __init__(
@@ -173,6 +182,7 @@ class Perception:
         self._grasps: dict[str, Grip] = {}
         self._places: dict[str, Grip] = {}
         self._moved = Grip(snapshot.ee_pose[:3], matrix(snapshot.ee_pose[3:]))
+        self.closed = hand.closed
 
     # -- names ---------------------------------------------------------------------------------------------------------
 
@@ -214,9 +224,10 @@ class Perception:
         """Where the hand counts as being: where it is, or at the end of what is planned already."""
         return self._moved
 
-    def move_hand(self, pos: np.ndarray, rotation: np.ndarray) -> None:
+    def move_hand(self, pos: np.ndarray, rotation: np.ndarray, *, closed: bool | None = None) -> None:
         """Let the hand, and what it holds, count as being elsewhere: at the end of a plan not yet followed."""
         self._moved = Grip(np.array(pos, float), np.array(rotation, float))
+        self.closed = self.closed if closed is None else closed
 
     @cached_property
     def held(self) -> str:
@@ -298,11 +309,23 @@ class Perception:
         observed = self._observed(name, part.cloud, lambda: self._grasp_part(name, part), self._part_target(part))
         values: dict[str, Any] = {"normal": _outward(part, self.world)}
         if part.joint is not None and part.kind != "knob":
-            pushing = tilted(-opening_direction(part), self.config.push_tilt, self.world.hand_rotation)
-            values["push_quat"] = quaternion(pushing)
+            values["push_quat"] = quaternion(self._pushing(part))
         if part.joint is not None:
             values |= {"axis": opening_direction(part), "is_open": part.joint.opened > 0.5 * part.joint.travel}
         return _changed(observed, values)
+
+    def _pushing(self, part: Part) -> np.ndarray:
+        """The hand [3, 3] that pushes a part shut: leaning into the push as far as the robot and things leave room."""
+        out = opening_direction(part)
+        start = part.cloud.points.mean(axis=0) + self.config.push_start * out
+        obstacles = np.concatenate([self.world.others(), self.world.walls])
+        obstacles = obstacles[np.linalg.norm(obstacles - start, axis=1) < 0.4]
+        hands = [tilted(-out, tilt, self.world.hand_rotation) for tilt in self.config.push_tilts]
+        wrists = [start - self.config.wrist_back * hand[:, 2] - self.base for hand in hands]
+        lacks = [max(self.config.nearest - float(np.linalg.norm(wrist[:2])), 0.0) for wrist in wrists]
+        rooms = [room_around(start, hand, obstacles, self.config.margins.gripper) for hand in hands]
+        costs = [lack + max(-room, 0.0) for lack, room in zip(lacks, rooms, strict=True)]
+        return hands[int(np.argmin(costs + self.config.less_tilt * np.arange(len(hands))))]
 
     def _observed(self, name: str, cloud: PointCloud, grasp: Callable[[], Grip], target: Target | None) -> Detected:
         points = cloud.points
@@ -447,7 +470,15 @@ class Perception:
             return Target(xy, cost, floor=part.box.pos[2] + half[2])
         xy, cost = grid_around(part.box.pos[:2], np.maximum(half[:2] - self.config.edge, 0.0))
         floor = max(part.box.pos[2] - half[2], self.world.ground(part.box.pos[:2]))
-        return Target(xy, cost, floor=floor, centre=part.box.pos[:2], half=half[:2])
+        target = Target(xy, cost, floor=floor, centre=part.box.pos[:2], half=half[:2])
+        out = _way_out(part, self.world) if part.kind == "space" else np.array([0.0, 0.0, 1.0])
+        if out[2] > 0.5:
+            return target
+        low, high = _cavity(part, self.world)
+        middle = (low + high)[:2] / 2
+        return Target(
+            middle[None], np.zeros(1), low[2], centre=middle, half=(high - low)[:2] / 2, entry=out, roof=high[2]
+        )
 
 
 def freeze(snapshot: ObjectsSnapshot) -> None:
@@ -491,35 +522,6 @@ def opening_direction(part: Part) -> np.ndarray:
     return _unit(np.cross(part.joint.axis, middle - part.joint.anchor))
 
 
-def pinching(towards: np.ndarray, tilt: float, length: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """A hand that leads with its fingers ``towards``, tilted from the vertical, and closes across ``length``.
-
-    Args:
-        towards: horizontal unit vector [3].
-        tilt: radians; 0 points down, pi / 2 along ``towards``.
-        length: direction of the bar to hold, [3].
-        current: the hand's present rotation, [3, 3].
-
-    Returns:
-        The rotation [3, 3] nearest to home, of equals the one nearest to the current one.
-    """
-    lies = abs(length[2]) < np.sqrt(0.5)
-    return _leading(towards, tilt, current, upright_closing=lies)
-
-
-def tilted(towards: np.ndarray, tilt: float, current: np.ndarray) -> np.ndarray:
-    """A hand likewise tilted that closes horizontally, across the way it leads, [3, 3]."""
-    return _leading(towards, tilt, current, upright_closing=False)
-
-
-def _leading(towards: np.ndarray, tilt: float, current: np.ndarray, *, upright_closing: bool) -> np.ndarray:
-    z = np.sin(tilt) * towards - np.cos(tilt) * np.array([0.0, 0.0, 1.0])
-    side = np.cross([0.0, 0.0, 1.0], towards)
-    across = np.cross(z, side) if upright_closing else side
-    hands = [np.stack([np.cross(y, z), y, z], axis=1) for y in (across, -across)]
-    return max(hands, key=lambda hand: float(np.trace(hand @ (HOME_ROTATION + 0.1 * current).T)))
-
-
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """Unit quaternion wxyz [4] of a rotation matrix [3, 3], w not negative."""
     m = np.asarray(rotation, float)
@@ -548,19 +550,69 @@ def _outward(part: Part, world: World) -> np.ndarray:
 
 
 def _way_out(part: Part, world: World) -> np.ndarray:
-    """Up out of a space, or if something roofs it, to the side that most lacks surface."""
+    """Up out of a space, or if something roofs it, to the side that has the least surface before it.
+
+    Where there is a door, it is its side. Of sides alike, the one that faces the robot is taken.
+    """
     assert part.box is not None
-    local = (part.cloud.points - part.box.pos) @ part.box.mat
-    mat = part.box.mat
-    share = local / part.box.half_extents
+    doors = [p for p in world.snapshot.parts.values() if p.parent == part.parent and p.kind == "door"]
+    if doors:
+        shut = (_shut(doors[0]).mean(axis=0) - part.box.pos) @ part.box.mat / part.box.half_extents
+        axis = int(np.abs(shut).argmax())
+        return part.box.mat[:, axis] * np.sign(shut[axis])
+    share = _surface_shares(part, world)
     faces = [(axis, sign) for axis in range(3) for sign in (1.0, -1.0)]
-    upward = max(faces, key=lambda face: face[1] * mat[2, face[0]])
-    covered = {face: int((share[:, face[0]] * face[1] > 0.8).sum()) for face in faces}
-    down = (upward[0], -upward[1])
-    sideways = [face for face in faces if face not in (upward, down)]
-    roofed = covered[upward] >= 0.1 * len(local)
-    best = min(sideways, key=lambda face: covered[face]) if roofed else upward
-    return part.box.mat[:, best[0]] * best[1]
+    ways = {face: part.box.mat[:, face[0]] * face[1] for face in faces}
+    before = {face: _points_before(share, *face) for face in faces}
+    upward = max(faces, key=lambda face: ways[face][2])
+    if before[upward] < 0.03 * len(share):
+        return ways[upward]
+    towards = np.zeros(3) if world.base is None else np.append(world.base - part.box.pos[:2], 0.0)
+    level = [face for face in faces if abs(ways[face][2]) < 0.5]
+    return ways[min(level, key=lambda face: (before[face], -float(ways[face] @ towards)))]
+
+
+def _shut(part: Part) -> np.ndarray:
+    """Points of a door as they are when it is shut, [N, 3]."""
+    assert part.joint is not None
+    half = -part.joint.opened / 2
+    turn = matrix(np.array([np.cos(half), *(np.sin(half) * part.joint.axis)]))
+    return (part.cloud.points - part.joint.anchor) @ turn.T + part.joint.anchor
+
+
+def _surface_shares(part: Part, world: World) -> np.ndarray:
+    """Surface of what a space is in, doors apart, in half extents of the space's box from its middle, [N, 3]."""
+    assert part.box is not None
+    doors = [p.cloud.points for p in world.snapshot.parts.values() if p.parent == part.parent and p.joint is not None]
+    points = _apart_from(np.concatenate([world.points(part.parent), part.cloud.points]), doors)
+    return (points - part.box.pos) @ part.box.mat / part.box.half_extents
+
+
+def _cavity(part: Part, world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner [3] of what is free of a space's box, walked from its middle to each side."""
+    assert part.box is not None
+    share = _surface_shares(part, world)
+    free = np.ones((2, 3))
+    for axis in range(3):
+        beside = (np.abs(np.delete(share, axis, axis=1)) < 0.45).all(axis=1)
+        for row, sign in enumerate((-1.0, 1.0)):
+            ahead = sign * share[beside, axis]
+            free[row, axis] = ahead[ahead > 0.1].min(initial=1.0)
+    ends = np.stack([-free[0], free[1]]) * part.box.half_extents @ part.box.mat.T + part.box.pos
+    return ends.min(axis=0), ends.max(axis=0)
+
+
+def _points_before(share: np.ndarray, axis: int, sign: float) -> int:
+    """How many points lie towards one face of a box, in the middle of the way; coordinates in half extents."""
+    ahead = (share[:, axis] * sign > 0.5) & (share[:, axis] * sign < 2.5)
+    return int((ahead & (np.abs(np.delete(share, axis, axis=1)) < 0.45).all(axis=1)).sum())
+
+
+def _apart_from(points: np.ndarray, clouds: Sequence[np.ndarray], distance: float = 0.02) -> np.ndarray:
+    """The points that are farther than a distance from every cloud."""
+    for cloud in clouds:
+        points = points[np.linalg.norm(points[:, None] - cloud[None, ::2], axis=2).min(axis=1) > distance]
+    return points
 
 
 def _least_turned(rotation: np.ndarray) -> np.ndarray:

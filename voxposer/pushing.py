@@ -38,6 +38,10 @@ class PushingConfig:
         over_ground: the grip site stays this far above the table.
         reach: horizontally from the robot's base, of a hand that points down.
         slanted_reach: less reach of a hand whose fingers lie level.
+        moved: a thing that moved less than this was pushed in vain.
+        elsewhere: another push touches at least this far from where one was in vain.
+        detour: how far a thing is pushed aside that cannot be pushed along its way.
+        detours: angles between that and the straight way, tried in turn to either side, radians.
         facing: cosine between a face and the push against it, at least.
         room: that the hand needs around it where a push starts.
         body: the closed hand in its own frame (x, y across the fingers, z out of them), lower and upper corners of the
@@ -60,6 +64,10 @@ class PushingConfig:
     over_ground: float = 0.02
     reach: float = 0.80
     slanted_reach: float = 0.12
+    moved: float = 0.008
+    elsewhere: float = 0.03
+    detour: float = 0.07
+    detours: tuple[float, ...] = (0.3, 0.6, 0.9, 1.2, 1.5)
     facing: float = 0.3
     room: float = 0.004
     body: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = (
@@ -78,17 +86,22 @@ class Pushing:
         way: places for its centre, world frame, [P, 3]; the last is where it shall be.
         cursor: the next of them.
         pushes: how many there were.
+        begun: where the thing's centre was and where the hand was to touch it in the latest push, [3] each.
+        vain: such touches of pushes that did not move it, relative to its centre, [3] each.
     """
 
     name: str
     way: np.ndarray
     cursor: int = 0
     pushes: int = 0
+    begun: tuple[np.ndarray, np.ndarray] | None = None
+    vain: list[np.ndarray] = field(default_factory=list)
 
 
 def arrived(pushing: Pushing, perception: Perception, config: PushingConfig = PushingConfig()) -> bool:
     """Whether the thing is where it shall be, or has been pushed often enough; places behind it are passed over."""
     centre = perception.snapshot.objects[pushing.name].points.mean(axis=0)
+    _learn(pushing, centre, config)
     left = (pushing.way[-1] - centre)[:2]
     if np.linalg.norm(left) <= config.near or pushing.pushes >= config.most:
         return True
@@ -96,6 +109,19 @@ def arrived(pushing: Pushing, perception: Perception, config: PushingConfig = Pu
     while pushing.cursor < last and left @ (pushing.way[pushing.cursor] - centre)[:2] <= config.near**2:
         pushing.cursor += 1
     return False
+
+
+def _learn(pushing: Pushing, centre: np.ndarray, config: PushingConfig) -> None:
+    """Remember a push in vain, so that the next one is another: from elsewhere, or as far as to where there is room."""
+    if pushing.begun is None:
+        return
+    before, contact = pushing.begun
+    pushing.begun = None
+    if np.linalg.norm((centre - before)[:2]) < config.moved:
+        pushing.vain.append(contact - before)
+        pushing.cursor = max(pushing.cursor - 1, 0)
+    else:
+        pushing.vain.clear()
 
 
 @dataclass(frozen=True)
@@ -107,18 +133,20 @@ class Sight:
         perception: the present snapshot.
         lowest: height below which the grip site must not go, metres.
         free: points that the hand has room to push at, bool [M].
+        goal: where to push the centre now, [3].
     """
 
     pushing: Pushing
     perception: Perception
     lowest: float
     free: np.ndarray
+    goal: np.ndarray
 
 
 def sight(pushing: Pushing, perception: Perception, config: PushingConfig) -> Sight:
-    """Where a thing can be pushed: towards the next place of its way, or else towards the first later one with room.
+    """Where a thing can be pushed: to the next place of its way, else to the first later one, else to one side.
 
-    The cursor moves along to that place.
+    The cursor moves along to a place of the way.
 
     Raises:
         PushError: the hand has no room to begin any push.
@@ -129,8 +157,22 @@ def sight(pushing: Pushing, perception: Perception, config: PushingConfig) -> Si
         free = _touchable(pushing, perception, pushing.way[cursor], lowest, config)
         if free.any():
             pushing.cursor = cursor
-            return Sight(pushing, perception, lowest, free)
+            return Sight(pushing, perception, lowest, free, pushing.way[cursor])
+    for goal in _detours(centre, pushing.way[-1], config):
+        free = _touchable(pushing, perception, goal, lowest, config)
+        if free.any():
+            pushing.cursor = max(pushing.cursor - 1, 0)
+            return Sight(pushing, perception, lowest, free, goal)
     raise PushError(f"the hand has no room to begin a push of {pushing.name}")
+
+
+def _detours(centre: np.ndarray, end: np.ndarray, config: PushingConfig) -> list[np.ndarray]:
+    """Places beside the straight way, those that lead away from it least first, [3] each."""
+    ahead = (end - centre) * [1.0, 1.0, 0.0]
+    ahead /= max(float(np.linalg.norm(ahead)), 1e-6)
+    aside = np.array([-ahead[1], ahead[0], 0.0])
+    turns = [sign * angle for angle in config.detours for sign in (1, -1)]
+    return [centre + config.detour * (np.cos(turn) * ahead + np.sin(turn) * aside) for turn in turns]
 
 
 def next_pushes(sights: Sequence[Sight], config: PushingConfig) -> list[list[Stop]]:
@@ -151,7 +193,7 @@ def _searched(sights: Sequence[Sight], config: PushingConfig) -> list[list[Stop]
 
     push = best_push(
         stacked([cloud.points for cloud in clouds]),
-        _padded(np.stack([s.pushing.way[s.pushing.cursor] for s in sights]), CHUNK - len(sights)),
+        _padded(np.stack([s.goal for s in sights]), CHUNK - len(sights)),
         jax.vmap(jax.random.key)(_padded(np.array([s.pushing.pushes for s in sights]), CHUNK - len(sights))),
         config.push,
         valid=_padded(np.stack([np.arange(most) < len(cloud.points) for cloud in clouds]), CHUNK - len(sights)),
@@ -159,7 +201,8 @@ def _searched(sights: Sequence[Sight], config: PushingConfig) -> list[list[Stop]
         touchable=stacked([s.free for s in sights]),
         lowest=_padded(np.array([s.lowest for s in sights]), CHUNK - len(sights)),
     )
-    for s in sights:
+    for i, s in enumerate(sights):
+        s.pushing.begun = clouds[i].points.mean(axis=0), np.asarray(push.contact[i], float)
         s.pushing.pushes += 1
         s.pushing.cursor = min(s.pushing.cursor + 1, len(s.pushing.way) - 1)
     return [_way(i, push, s.perception, s.lowest, config) for i, s in enumerate(sights)]
@@ -184,14 +227,24 @@ def _touchable(
     cloud = perception.snapshot.objects[pushing.name]
     ahead = (target - cloud.points) * [1.0, 1.0, 0.0]
     ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
-    met = cloud.points - _reach_back(cloud.points, ahead, lowest, config)[:, None] * ahead
-    room = [_fits(perception, met, ahead, lowest, *start, config) for start in config.starts]
-    return np.any(room, axis=0) & ((cloud.normals * ahead).sum(axis=1) < -config.facing)
+    rows = np.flatnonzero((cloud.normals * ahead).sum(axis=1) < -config.facing)
+    touchable = np.zeros(len(cloud.points), bool)
+    if not len(rows):
+        return touchable
+    ahead = ahead[rows]
+    met = cloud.points[rows] - _reach_back(cloud.points, rows, ahead, lowest, config)[:, None] * ahead
+    room = np.any([_fits(perception, met, ahead, lowest, *start, config) for start in config.starts], axis=0)
+    for place in pushing.vain:
+        room &= np.linalg.norm((met - cloud.points.mean(axis=0) - place)[:, :2], axis=1) > config.elsewhere
+    touchable[rows] = room
+    return touchable
 
 
-def _reach_back(points: np.ndarray, ahead: np.ndarray, lowest: float, config: PushingConfig) -> np.ndarray:
-    """How far behind each point the thing is met first by a hand that comes from behind, metres [M]."""
-    touched = np.maximum(points, [-np.inf, -np.inf, lowest])
+def _reach_back(
+    points: np.ndarray, rows: np.ndarray, ahead: np.ndarray, lowest: float, config: PushingConfig
+) -> np.ndarray:
+    """How far behind some of the points the thing is met first by a hand that comes from behind, metres [len(rows)]."""
+    touched = np.maximum(points[rows], [-np.inf, -np.inf, lowest])
     offset = points[None] - touched[:, None]
     back = -np.einsum("ijk,ik->ij", offset, ahead)
     aside = np.linalg.norm((offset + back[..., None] * ahead[:, None])[..., :2], axis=2)
@@ -211,9 +264,9 @@ def _fits(
     """Whether the hand has room where pushes of ``contacts`` [M, 3] along ``ahead`` [M, 3] start, bool [M]."""
     start = contacts - distance * ahead
     start[:, 2] = np.maximum(start[:, 2], lowest)
-    obstacles = perception.world.others()
+    obstacles = np.concatenate([perception.world.others(), perception.world.walls])
     obstacles = obstacles[np.linalg.norm((obstacles - contacts.mean(axis=0))[:, :2], axis=1) < 0.4]
-    obstacles = obstacles[obstacles[:, 2] > lowest - config.over_ground + 0.005]
+    obstacles = _thinned(obstacles[obstacles[:, 2] > lowest - config.over_ground + 0.005])
     up = np.array([0.0, 0.0, 1.0])
     out = np.sin(slant) * ahead - np.cos(slant) * up
     left = np.cross(up, ahead)
@@ -225,6 +278,12 @@ def _fits(
     reach = config.reach - config.slanted_reach * max(np.sin(slant), 0.0)
     near = np.linalg.norm((start - perception.base)[:, :2], axis=1) < reach
     return ~np.asarray(hit.any(axis=1)) & near
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """One point of each cubic centimetre."""
+    _, first = np.unique(np.round(points / 0.01).astype(int), axis=0, return_index=True)
+    return points[first]
 
 
 def _stops(poses: np.ndarray, velocity: np.ndarray) -> list[Stop]:

@@ -19,6 +19,8 @@ from voxposer.world import World, around
 
 # Hands whose axis has at most this vertical component point down.
 _UPRIGHT = -0.98
+# How far a hand moves aside with a thing over which something hangs, metres.
+_ASIDE = (0.02, 0.04, 0.06, 0.08, 0.10, 0.12)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +99,20 @@ def travel_route(
         held: the thing in the hand, "" for none.
         config: margins.
     """
+    aside = _from_under(world, held, stops[0].pos) if held else np.zeros(3)
+    if not aside.any():
+        return _raised(stops, axes, world, held, config)
+    clear = replace(stops[0], pos=stops[0].pos + aside)
+    goal = stops[-1]
+    if np.linalg.norm((goal.pos - stops[0].pos)[:2]) < config.here:
+        goal = replace(goal, pos=goal.pos + aside)
+    return [clear, *_raised([clear, *stops[1:-1], goal], axes, world, held, config)]
+
+
+def _raised(
+    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: World, held: str, config: RouteConfig
+) -> list[Stop]:
+    """The way of a hand over which nothing hangs at its start."""
     start, goal = stops[0], stops[-1]
     if _direct(goal.pos - start.pos, axes, config):
         return [goal]
@@ -110,6 +126,32 @@ def travel_route(
     whole = [*begin, *middle, *end[::-1]]
     keep = corners(np.array([stop.pos for stop in whole]), config.straight, _marks(whole))
     return [whole[i] for i in keep]
+
+
+def _from_under(world: World, held: str, hand: np.ndarray) -> np.ndarray:
+    """The shortest level move [3] after which what is held can go straight up; zero if it can, or if there is none."""
+    thing = world.points(held)[::2] - world.hand + hand
+    near = np.concatenate([world.others(held), world.walls])
+    near = near[np.linalg.norm(near[:, :2] - thing[:, :2].mean(axis=0), axis=1) < _ASIDE[-1] + 0.12]
+    above = near[near[:, 2] > thing[:, 2].min() + 0.015]
+    level = near[near[:, 2] > thing[:, 2].min() + 0.005]
+    if not _under(thing, above):
+        return np.zeros(3)
+    for far in _ASIDE:
+        for angle in np.arange(16) * np.pi / 8:
+            move = far * np.array([np.cos(angle), np.sin(angle), 0.0])
+            hits = (np.linalg.norm(thing[None] + share * move - level[:, None], axis=2) < 0.008 for share in (0.5, 1))
+            if not _under(thing + move, above) and not any(hit.any() for hit in hits):
+                return move
+    return np.zeros(3)
+
+
+def _under(thing: np.ndarray, points: np.ndarray) -> bool:
+    """Whether one of some points is straight above a thing's."""
+    if not len(points):
+        return False
+    apart = np.linalg.norm(thing[:, None, :2] - points[None, :, :2], axis=2)
+    return bool(((apart < 0.012) & (points[None, :, 2] > thing[:, None, 2] + 0.005)).any())
 
 
 def _direct(way: np.ndarray, axes: tuple[np.ndarray, np.ndarray], config: RouteConfig) -> bool:

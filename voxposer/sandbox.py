@@ -409,8 +409,12 @@ class _Run:
         }
 
     def outcome(self) -> Outcome:
-        """Run the program."""
-        ended = self._block(self._program.body)
+        """Run the program, once: the tables refer back to this run, which would keep its maps until the next cycle
+        collection."""
+        try:
+            ended = self._block(self._program.body)
+        finally:
+            self._do, self._evaluate = {}, {}
         if ended is None and self._returns is not None:
             self._value = self._variables.get(self._returns)
         return Outcome(value=self._value, variables=MappingProxyType(self._variables))

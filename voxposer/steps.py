@@ -70,7 +70,8 @@ def touches(perception: Perception, request: Request, config: RouteConfig) -> bo
     ends = np.argwhere(request.targets)
     goal = perception.position_of(ends[int(np.linalg.norm(ends - here, axis=1).argmin())])
     hold = {"held": perception.held, "attached": perception.attached}
-    return works(perception.ee.pos, goal, closed=request.closed_at(here), config=config, **hold)
+    closed = perception.closed and request.closed_at(here)
+    return works(perception.ee.pos, goal, closed=closed, config=config, **hold)
 
 
 def obstacle_map(perception: Perception, request: Request, route: RouteConfig) -> np.ndarray:

@@ -44,6 +44,8 @@ class Margins:
         drop_cost: letting go above the place of rest, for want of room for the hand, costs this much a metre.
         widest_turn: hands turn no further than this from home, radians.
         overhang_scale: sticking out this much of a box to fit in costs one point.
+        grasp_tilts: of a hand from the vertical, tried where no upright one has room to grasp, radians.
+        entry_tilts: of a hand that enters a space from a side, from the vertical, radians.
         least_lift: the hand rises at least this much with what it holds.
         retreat: the hand backs off this far after releasing.
     """
@@ -69,6 +71,8 @@ class Margins:
     drop_cost: float = 10.0
     widest_turn: float = 1.75
     overhang_scale: float = 0.005
+    grasp_tilts: tuple[float, ...] = ()
+    entry_tilts: tuple[float, ...] = (1.4, 1.1, 0.8)
     least_lift: float = 0.08
     retreat: float = 0.08
 
@@ -168,6 +172,12 @@ def spun(rotation: np.ndarray, angle: float) -> np.ndarray:
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ rotation
 
 
+def leaning(angle: float) -> np.ndarray:
+    """Rotation [3, 3] that takes a hand which points down to one whose fingers lead along world x, by an angle."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+
+
 def around(xy: np.ndarray, points: np.ndarray, radius: float) -> np.ndarray:
     """The points within a horizontal distance."""
     return points[np.linalg.norm(points[:, :2] - xy, axis=1) < radius]
@@ -179,3 +189,32 @@ def upright(rotation: np.ndarray) -> np.ndarray:
     y /= max(float(np.linalg.norm(y)), 1e-9)
     z = np.array([0.0, 0.0, -1.0])
     return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def pinching(towards: np.ndarray, tilt: float, length: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """A hand that leads with its fingers ``towards``, tilted from the vertical, and closes across ``length``.
+
+    Args:
+        towards: horizontal unit vector [3].
+        tilt: radians; 0 points down, pi / 2 along ``towards``.
+        length: direction of the bar to hold, [3].
+        current: the hand's present rotation, [3, 3].
+
+    Returns:
+        The rotation [3, 3] nearest to home, of equals the one nearest to the current one.
+    """
+    lies = abs(length[2]) < np.sqrt(0.5)
+    return _leading(towards, tilt, current, upright_closing=lies)
+
+
+def tilted(towards: np.ndarray, tilt: float, current: np.ndarray) -> np.ndarray:
+    """A hand likewise tilted that closes horizontally, across the way it leads, [3, 3]."""
+    return _leading(towards, tilt, current, upright_closing=False)
+
+
+def _leading(towards: np.ndarray, tilt: float, current: np.ndarray, *, upright_closing: bool) -> np.ndarray:
+    z = np.sin(tilt) * towards - np.cos(tilt) * np.array([0.0, 0.0, 1.0])
+    side = np.cross([0.0, 0.0, 1.0], towards)
+    across = np.cross(z, side) if upright_closing else side
+    hands = [np.stack([np.cross(y, z), y, z], axis=1) for y in (across, -across)]
+    return max(hands, key=lambda hand: float(np.trace(hand @ (HOME_ROTATION + 0.1 * current).T)))

@@ -19,6 +19,7 @@ from vecenv.contract import BatchEnv, Control, ResetInfo
 BUILTIN = {
     "pick_place": "eval.policies.pick_place:PickPlacePolicy",
     "random": "eval.policies.random:RandomPolicy",
+    "simpler_scripted": "eval.policies.simpler_scripted:SimplerScriptedPolicy",
     "voxposer": "eval.policies.voxposer:VoxPoserPolicy",
     "zero": "eval.policies.scripted:ZeroPolicy",
 }

@@ -12,6 +12,7 @@ from typing import Any
 from vecenv.contract import BatchEnv, Control, ResetInfo
 from voxposer.agent import Agent, AgentConfig, Slot
 from voxposer.llm import Llm, LlmConfig
+from voxposer.simpler_scene import hands
 
 
 class VoxPoserPolicy:
@@ -42,8 +43,11 @@ class VoxPoserPolicy:
         self.agent: Agent | None = None
 
     def reset(self, env: BatchEnv, info: ResetInfo) -> None:
-        """Begin with a freshly placed batch."""
-        self.agent = Agent(env, info.instruction, self._llm, self.config, self._prompts_dir)
+        """Begin with a freshly placed batch, and let go of the one before."""
+        if self.agent is not None:
+            self.agent.close()
+        seen, config = hands(env, info.suite, self.config)
+        self.agent = Agent(seen, info.instruction, self._llm, config, self._prompts_dir)
 
     def act(self, env: BatchEnv) -> Control:
         """Plan and follow the next subtask of every slot."""

@@ -42,7 +42,7 @@ from vecenv.simpler.layouts import episode_layout, episode_seed
 from vecenv.simpler.scenes import instances
 from vecenv.simpler.servo import Servo, ServoConfig
 from vecenv.simpler.tasks import NUM_EPISODES, SimplerTask, find_task, list_tasks
-from vecenv.simpler.variants import Variant, make_variant, varied
+from vecenv.simpler.variants import Variant, make_variant, require_files, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 
 if TYPE_CHECKING:
@@ -189,7 +189,10 @@ class SimplerEnv:
         key, chosen = (task, episode), self.tasks[task]
         if key not in self._prepared:
             layout = episode_layout(chosen, episode_seed(episode))
-            self._prepared[key] = prepare(*varied(chosen, layout, self.config.variant), self._root)
+            chosen, layout = varied(chosen, layout, self.config.variant)
+            if self.config.variant is not None:
+                require_files(chosen, self._root)
+            self._prepared[key] = prepare(chosen, layout, self._root)
         return self._prepared[key]
 
     def reset(self) -> ResetInfo:
@@ -389,11 +392,12 @@ class SimplerEnv:
         ticks = np.where(driving, servo.config.max_steps, hold)
         going, used, arrived = moves & ~self._done, np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
         while going.any():
-            actions = servo.actions(targets, driving, self._facts)
+            actions = servo.actions(targets, driving & going, self._facts)
             reward += self._tick(actions, going)
             used += going
             arrived = servo.arrived(targets, self._facts["tcp"])
-            going = going & ~self._done & (used < ticks) & ~(driving & arrived)
+            stuck = servo.stuck(targets, self._facts["tcp"], driving & going)
+            going = going & ~self._done & (used < ticks) & ~(driving & arrived) & ~stuck
         return arrived
 
     def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
@@ -662,7 +666,7 @@ class _Followed:
         while (going := (self._at < length) & ~env._done & self._patient()).any():
             here = np.minimum(self._at, length - 1)
             targets, driving = self._targets[self._rows, here], self._hold[self._rows, here] == 0
-            reward += env._tick(servo.actions(targets, driving, env._facts), going)
+            reward += env._tick(servo.actions(targets, driving & going, env._facts), going)
             self.ticks[self._rows[going], here[going]] += 1
             self._leave(going, here, targets, driving)
         return reward
@@ -674,7 +678,8 @@ class _Followed:
         env, rows = self._env, self._rows
         arrived = env._servo.arrived(targets, env._facts["tcp"])
         limit = np.where(driving, env._servo.config.max_steps, self._hold[rows, here])
-        spent = self.ticks[rows, here] >= limit
+        stuck = env._servo.stuck(targets, env._facts["tcp"], driving & going)
+        spent = stuck | (self.ticks[rows, here] >= limit)
         leaving = going & ((driving & arrived) | spent)
         self.converged[rows[leaving], here[leaving]] = arrived[leaving]
         missed = leaving & driving & ~arrived

@@ -177,6 +177,7 @@ def _start(layout: Layout, roles: Roles) -> Start:
         objects=np.array(poses, float).reshape(-1, 7),
         source=roles.source,
         target=roles.target,
+        late=tuple(i for i, placed in enumerate(layout.objects) if placed.role == "distractor"),
         drawer=roles.drawer,
         opened=layout.drawer_qpos,
     )

@@ -43,7 +43,8 @@ class Placed:
 
     Attributes:
         model: its name, also of its folder in the asset tree.
-        role: ``source`` (what is to be moved), ``target``, ``other``, or ``fixture`` (does not move).
+        role: ``source`` (what is to be moved), ``target``, ``other``, ``distractor`` (likewise, but dropped when the
+            rest has settled), or ``fixture`` (does not move).
         position: metres, world frame; where it is dropped, or stands.
         quat: wxyz, world frame.
         density: kg/m³, where it is not the one of its file.

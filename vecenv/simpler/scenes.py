@@ -32,6 +32,9 @@ _STILL_LINEAR, _STILL_ANGULAR = 1e-3, 1e-2
 _AWAY = sapien.Pose([-10.0, 0.0, 0.0])
 _UPRIGHT = [False, False, False, True, True, False]
 _FREE, _LOCKED = [False] * 6, [True] * 6
+_STRAIGHT = [True, True, False, True, True, False]
+# Objects that fall later wait this far above their places, times their number.
+_WAITING = np.array([0.0, 0.0, 5.0, 0.0, 0.0, 0.0, 0.0])
 # Which of a drawer's collision shapes is its floor.
 _FLOOR_SHAPE = 2
 # The Google Robot's fingers weigh almost nothing for their drives. PhysX 5 then leaves a residue when they press on
@@ -155,6 +158,7 @@ class Start:
         objects: poses [n, 7], in the order of the spec; those not anchored fall from there and settle.
         settled: None, or pose and velocity [n, 13] that settling has led to before.
         source, target: indices of the objects the task is about; -1 for none.
+        late: indices of objects that fall one after the other, straight down, when the others have settled.
         drawer: index of the task's drawer, -1 for none. opened: how far it is open, metres.
     """
 
@@ -164,6 +168,7 @@ class Start:
     settled: np.ndarray | None = None
     source: int = -1
     target: int = -1
+    late: tuple[int, ...] = ()
     drawer: int = -1
     opened: float = 0.0
 
@@ -355,9 +360,9 @@ class Scene:
             self.cabinet.place(np.zeros(len(self.cabinet.joints), np.float32))
         if start.settled is None:
             self._settle(start)
-        else:
-            self._restore_objects(start.settled)
-        settled = self._object_states()
+        settled = self._object_states() if start.settled is None else start.settled
+        # Also what has just settled, so that an episode begins the same way every time.
+        self._restore_objects(settled)
         self.robot.place(np.asarray(start.qpos, np.float32))
         self.robot.physx.set_root_pose(pose_of(start.base_pose))
         for joint, target in zip(self.robot.joints, start.qpos, strict=True):
@@ -372,24 +377,34 @@ class Scene:
     def _settle(self, start: Start) -> None:
         self.robot.place(np.asarray(start.qpos, np.float32))
         self.robot.physx.set_root_pose(_AWAY)
-        for entity, body, pose, thing in self._things(start.objects):
-            entity.set_pose(pose_of(pose))
+        for i, (entity, body, pose, thing) in enumerate(self._things(start.objects)):
+            waits = i in start.late
+            entity.set_pose(pose_of(pose + _WAITING * (i + 1) if waits else pose))
             _stop(body)
-            body.set_locked_motion_axes(_LOCKED if thing.anchored else _UPRIGHT)
-        loose = [body for _, body, _, thing in self._things(start.objects) if not thing.anchored]
+            body.set_locked_motion_axes(_LOCKED if thing.anchored or waits else _UPRIGHT)
+        bodies = enumerate(zip(self._bodies, self.spec.objects, strict=True))
+        loose = [body for i, (body, thing) in bodies if not thing.anchored and i not in start.late]
         if not loose:
             return
         self._pass(_FALL)
         for body in loose:
-            body.set_locked_motion_axes(_FREE)
-            # PhysX puts resting bodies to sleep; setting the pose wakes them, as upstream does.
-            body.entity.set_pose(body.entity.pose)
-            _stop(body)
-            body.wake_up()
+            _release(body)
         self._pass(_REST)
-        linear = sum(np.linalg.norm(body.linear_velocity) for body in loose)
-        angular = sum(np.linalg.norm(body.angular_velocity) for body in loose)
-        if linear > _STILL_LINEAR or angular > _STILL_ANGULAR:
+        if _moving(loose):
+            self._pass(_LONGER)
+        self._settle_late(start)
+
+    def _settle_late(self, start: Start) -> None:
+        late = [self._bodies[i] for i in start.late]
+        for i, body in zip(start.late, late, strict=True):
+            body.entity.set_pose(pose_of(start.objects[i]))
+            _stop(body)
+            body.set_locked_motion_axes(_STRAIGHT)
+            self._pass(_FALL)
+        for body in late:
+            _release(body)
+            self._pass(_REST)
+        if _moving(late):
             self._pass(_LONGER)
 
     def _things(self, poses: np.ndarray) -> Iterator[tuple[Any, Any, np.ndarray, ObjectBody]]:
@@ -574,6 +589,20 @@ def _dynamic(entity: sapien.Entity) -> physx.PhysxRigidDynamicComponent:
     if body is None:
         raise ValueError(f"{entity.name} has no dynamic body")
     return body  # type: ignore
+
+
+def _release(body: Any) -> None:
+    body.set_locked_motion_axes(_FREE)
+    # PhysX puts resting bodies to sleep; setting the pose wakes them, as upstream does.
+    body.entity.set_pose(body.entity.pose)
+    _stop(body)
+    body.wake_up()
+
+
+def _moving(bodies: Sequence[Any]) -> bool:
+    linear = sum(np.linalg.norm(body.linear_velocity) for body in bodies)
+    angular = sum(np.linalg.norm(body.angular_velocity) for body in bodies)
+    return bool(linear > _STILL_LINEAR or angular > _STILL_ANGULAR)
 
 
 def _stop(body: physx.PhysxRigidDynamicComponent) -> None:

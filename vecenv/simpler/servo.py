@@ -24,6 +24,8 @@ class ServoConfig:
         pos_tol: metres, rot_tol: radians, within which it has arrived.
         max_advance_pos, max_advance_rot: metres and radians that the reference moves in a tick at most.
         lead: how many of those steps the reference may be ahead of the tool.
+        stuck_after: a tool that has come no nearer for so many ticks is stuck, and its waypoint ends.
+        nearer: what counts as nearer, as a share of the tolerances.
     """
 
     max_steps: int = 100
@@ -32,6 +34,8 @@ class ServoConfig:
     max_advance_pos: float
     max_advance_rot: float
     lead: float = 2.0
+    stuck_after: int = 6
+    nearer: float = 0.1
 
     @classmethod
     def of(cls, robot: Robot) -> ServoConfig:
@@ -51,6 +55,9 @@ class Servo:
         self.controller, self.config = controller, config
         self._reference = np.zeros((controller.count, 7))
         self._known = np.zeros(controller.count, bool)
+        self._wanted = np.full((controller.count, 7), np.nan)
+        self._nearest = np.full(controller.count, np.inf)
+        self._idle = np.zeros(controller.count, int)
 
     def forget(self, slots: np.ndarray) -> None:
         """Slots (bool [B]) did something else, so their references mean nothing any more."""
@@ -85,6 +92,20 @@ class Servo:
         """Which tools [B, 7] are within tolerance of their targets [B, 8], bool [B]."""
         near = np.linalg.norm(targets[:, :3] - tool[:, :3], axis=1) <= self.config.pos_tol
         return near & (np.linalg.norm(_turn(tool, targets), axis=1) <= self.config.rot_tol)
+
+    def stuck(self, targets: np.ndarray, tool: np.ndarray, driving: np.ndarray) -> np.ndarray:
+        """Which of the tools [B, 7] that are driven to ``targets`` [B, 8] come no nearer, bool [B].
+
+        To be asked once a tick: it counts. A new target begins the count anew.
+        """
+        new = ~driving | (self._wanted != targets[:, :7]).any(axis=1)
+        way = np.linalg.norm(targets[:, :3] - tool[:, :3], axis=1) / self.config.pos_tol
+        distance = np.maximum(way, np.linalg.norm(_turn(tool, targets), axis=1) / self.config.rot_tol)
+        nearer = new | (distance < self._nearest - self.config.nearer)
+        self._wanted = targets[:, :7].copy()
+        self._nearest = np.where(nearer, distance, self._nearest)
+        self._idle = np.where(nearer, 0, self._idle + 1)
+        return driving & (self._idle >= self.config.stuck_after)
 
 
 def in_frame(poses: np.ndarray, frames: np.ndarray) -> np.ndarray:

@@ -8,19 +8,24 @@ It shows the drawn scene, so ``overlay="none"`` belongs to most of these.
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from vecenv.assets import AssetsMissing
+from vecenv.simpler.assets import NAME
 from vecenv.simpler.layouts import Layout, Placed
 from vecenv.simpler.tasks import DATA, DirectionalLight, Lighting, SimplerTask, Stage
 
 _ON_TABLE, _AT_CABINET = ("pick", "move_near"), ("open", "close", "place")
 _GOOGLE_FAMILIES = (*_ON_TABLE, *_AT_CABINET)
 _COKE = "opened_coke_can"
+_FROM_UPSTREAM = "copy it from ManiSkill2_real2sim's repository; `vecenv assets pull` knows what visual matching needs"
 _AMBIENT = (0.3, 0.3, 0.3)
 
 
@@ -128,6 +133,20 @@ def varied(task: SimplerTask, layout: Layout, variant: Variant | None) -> tuple[
     return changed, _with_objects(changed, _with_camera(layout, variant), variant)
 
 
+def require_files(task: SimplerTask, root: Path) -> None:
+    """Whether the meshes that the cabinet is drawn with are there; some of upstream's cabinets have one.
+
+    Raises:
+        AssetsMissing: one is not; the message names it.
+    """
+    if task.station is None or not (root / task.station).is_file():
+        return
+    folder = task.station.parent
+    for name in dict.fromkeys(mesh.attrib["filename"] for mesh in ET.parse(root / task.station).iter("mesh")):
+        if not (root / folder / name).is_file():
+            raise AssetsMissing(NAME, f"{root} has no {folder / name}, a part of {task.station.name}", _FROM_UPSTREAM)
+
+
 def _task_changes(task: SimplerTask, variant: Variant) -> dict[str, Any]:
     changes: dict[str, Any] = {}
     cabinet = task.family in _AT_CABINET
@@ -179,5 +198,5 @@ def _beside(layout: Layout, models: tuple[str, ...]) -> list[Placed]:
         while np.linalg.norm(place - middle) <= _APART:
             place = np.clip(middle + rng.uniform(-_SPREAD, _SPREAD, [2]), *_CORNERS)
         position = (float(place[0]), float(place[1]), can.position[2])
-        found.append(Placed(model=model, role="other", position=position, quat=can.quat))
+        found.append(Placed(model=model, role="distractor", position=position, quat=can.quat))
     return found

@@ -1,0 +1,123 @@
+"""Pull and push drawers with closed fingers, where the arm can: waypoints from a drawer's shape.
+
+In: a drawer as a ``Part`` (surface points, joint), and the arm's posture. Out: waypoints. Above the front of each of the
+cabinet's drawers is a gap of 10 cm; slanting fingers reach through it, press on the front's upper edge from behind, and
+take it along. Where along the edge and at which angles is decided by rehearsing all of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from eval.policies.simpler_reach import Arm, Waypoint, pose, through
+from vecenv.contract import Part
+from vecenv.simpler.kinematics import rotvec_from_rotation
+
+# Angles of the closed fingers, radians: below the horizontal, and sideways.
+_HOOK_PITCHES = np.deg2rad([25.0, 30.0, 35.0])
+_PUSH_PITCHES = np.deg2rad([0.0, 20.0, 40.0])
+_YAWS = np.deg2rad([-20.0, -10.0, 0.0, 10.0, 20.0])
+# Where along the front, as a share of half its width.
+_PLACES = (-0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6)
+# Fingertips come this far below the edge, from this far above it, the hand starts this far before it, and presses this
+# deep, metres.
+_HOOKED, _OVER, _BEFORE, _PRESS = 0.005, 0.025, 0.18, 0.005
+# Two stops on the way in, as shares of it that are left. From the second on the hand moves level, because the arm sags
+# below a straight line, by about this much (metres).
+_ENTRY, _SAGS = (1.0, 0.3), 0.01
+# Fingers may slip this far before they take the drawer along, metres.
+_SLACK = 0.06
+# Pushing begins so far before the front, and goes on so far beyond closed.
+_AWAY, _BEYOND = 0.06, 0.01
+# Sideways angles and places off the middle cost as much as this much room at the joints' limits, radians.
+_PREFER_STRAIGHT, _PREFER_MIDDLE = 1.0, 0.2
+# So does every radian that the hand is turned on the way there.
+_PREFER_NEAR = 0.15
+# More room than this is no better, radians.
+_ROOM_ENOUGH = 0.3
+
+
+def hook_and_pull(arm: Arm, qpos: np.ndarray, base: np.ndarray, drawer: Part, opened: float) -> list[Waypoint]:
+    """Open a drawer until its joint is at ``opened``, metres; the hand ends where it can leave upwards."""
+    joint = drawer.joint
+    assert joint is not None, "a drawer has a joint"
+    edge = _upper_edge(drawer)
+    ways, turns, dear = [], [], []
+    for pitch, yaw, place, flip in itertools.product(_HOOK_PITCHES, _YAWS, _PLACES, (1.0, -1.0)):
+        approach, turn = _facing(arm, pitch, yaw, flip)
+        behind = (_HOOKED + arm.hand.thickness / np.cos(pitch)) / np.tan(pitch)
+        tip = np.array([edge[0, 0] - behind, _along(edge, place), edge[1, 2] - _HOOKED])
+        at = tip - arm.hand.tip * approach
+        over, pressed = at + [0, 0, _OVER], at - [0, 0, _PRESS]
+        pulled = pressed + (opened + _SLACK - joint.opened) * joint.axis
+        before, outside = (over - share * _BEFORE * approach for share in _ENTRY)
+        inside = np.array([*outside[:2], over[2] + _SAGS])
+        ways.append([before, inside, over, at, pulled, pulled + [0, 0, 2 * _OVER]])
+        turns.append(turn)
+        dear.append(_PREFER_STRAIGHT * abs(yaw) + _PREFER_MIDDLE * abs(place))
+    stops, turn = _best(arm, qpos, base, np.array(ways), np.array(turns), np.array(dear))
+    return through(stops, turn, 1.0)
+
+
+def push(arm: Arm, qpos: np.ndarray, base: np.ndarray, drawer: Part) -> list[Waypoint]:
+    """Close a drawer."""
+    joint = drawer.joint
+    assert joint is not None, "a drawer has a joint"
+    edge = _upper_edge(drawer)
+    ways, turns, dear = [], [], []
+    for pitch, yaw, place, flip in itertools.product(_PUSH_PITCHES, _YAWS, _PLACES, (1.0, -1.0)):
+        approach, turn = _facing(arm, pitch, yaw, flip)
+        tip = np.array([edge[1, 0], _along(edge, place), edge[1, 2] - 2 * arm.hand.thickness])
+        at = tip - arm.hand.tip * approach
+        ways.append([at + _AWAY * joint.axis, at, at - (joint.opened + _BEYOND) * joint.axis])
+        turns.append(turn)
+        dear.append(_PREFER_STRAIGHT * abs(yaw) + _PREFER_MIDDLE * abs(place))
+    stops, turn = _best(arm, qpos, base, np.array(ways), np.array(turns), np.array(dear))
+    last = Waypoint(pose(stops[-1], turn), 1.0, hold=3)
+    return [*through(stops, turn, 1.0), last]
+
+
+def opening(drawer: Part) -> np.ndarray:
+    """Middle of the part of a drawer that is out, at the height of its front's upper edge, [3]."""
+    joint = drawer.joint
+    assert joint is not None, "a drawer has a joint"
+    edge = _upper_edge(drawer)
+    back = np.array([edge[0, 0], edge[:, 1].mean(), edge[1, 2]])
+    return back - joint.opened / 2 * joint.axis
+
+
+def contains(drawer: Part, point: np.ndarray) -> bool:
+    """Whether a point is inside a drawer."""
+    assert drawer.box is not None, "a drawer has a box"
+    return bool((np.abs(point - drawer.box.pos) < drawer.box.half_extents).all())
+
+
+def _best(
+    arm: Arm, qpos: np.ndarray, base: np.ndarray, ways: np.ndarray, turns: np.ndarray, dear: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stops [T, 3] and rotation [3, 3] of the way that leaves most room."""
+    room, _ = arm.rehearse(qpos, base, ways, np.repeat(turns[:, None], ways.shape[1], axis=1))
+    _, facing = arm.tool(qpos, base)
+    far = np.linalg.norm(rotvec_from_rotation(turns @ facing.T), axis=1)
+    best = int(np.argmax(np.minimum(room, _ROOM_ENOUGH) - dear - _PREFER_NEAR * far))
+    return ways[best], turns[best]
+
+
+def _facing(arm: Arm, pitch: float, yaw: float, flip: float) -> tuple[np.ndarray, np.ndarray]:
+    """Approach against the drawers' axis, which is x, and rotation of a hand that opens sideways."""
+    approach = np.array([-np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)])
+    opening = flip * np.cross([0.0, 0.0, 1.0], approach)
+    return approach, arm.hand.rotation(approach, opening / np.linalg.norm(opening))
+
+
+def _upper_edge(drawer: Part) -> np.ndarray:
+    """Lower and upper corner of the drawer's highest points: its front's upper edge, [2, 3]."""
+    points = drawer.cloud.points
+    top = points[points[:, 2] > points[:, 2].max() - 1e-3]
+    return np.stack([top.min(axis=0), top.max(axis=0)])
+
+
+def _along(edge: np.ndarray, place: float) -> float:
+    return float(edge[:, 1].mean() + place * (edge[1, 1] - edge[0, 1]) / 2)

@@ -1,0 +1,227 @@
+"""How each family of SIMPLER's tasks is solved with ground truth: scripts that yield waypoints and get a new look.
+
+A script is a generator: it yields a list of ``Waypoint`` for its own slot, and is sent a ``Look`` at what came of it.
+It ends when it has done what it can; the policy begins it anew while the task is not solved. Geometry comes from the
+look alone; constants here are of the gripper or of a family, never of an episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from eval.policies import simpler_drawers as drawers
+from eval.policies.simpler_grasps import Grasp, choose
+from eval.policies.simpler_reach import Arm, Waypoint, pose, through
+from vecenv.contract import ObjectsSnapshot
+
+# Above a thing before it is grasped, and above everything while it is carried, metres.
+_ABOVE, _CARRIED = 0.08, 0.10
+# An object has come along when it has risen by this share of what the hand has.
+_FOLLOWED = 0.5
+# Between a thing and what it is lowered onto, metres: contact ends the rest.
+_GAP = 0.004
+# Between a thing and what it is set beside, metres.
+_BESIDE = 0.02
+# A drawer is pulled open so far, metres.
+_OPENED = 0.21
+# What is put into a drawer goes in at most so far beside its middle, metres.
+_ASIDE = 0.15
+
+
+@dataclass(frozen=True)
+class Look:
+    """One slot now: ground truth, the joints ``qpos`` [N], the root's world pose ``base`` [7], and ticks that are left."""
+
+    snapshot: ObjectsSnapshot
+    qpos: np.ndarray
+    base: np.ndarray
+    left: int
+
+    def points(self, name: str) -> np.ndarray:
+        """Points on the surface of a thing, [n, 3]."""
+        return self.snapshot.objects[name].points
+
+    def low(self, name: str) -> np.ndarray:
+        """Lower corner of the box around a thing, [3]."""
+        return self.points(name).min(axis=0)
+
+    def high(self, name: str) -> np.ndarray:
+        """Upper corner, [3]."""
+        return self.points(name).max(axis=0)
+
+    def middle(self, name: str) -> np.ndarray:
+        """Centre of the box around a thing, [3]."""
+        return (self.low(name) + self.high(name)) / 2
+
+
+@dataclass
+class Memory:
+    """What a slot remembers between attempts: grasps that did not hold."""
+
+    failed: list[Grasp] = field(default_factory=list)
+
+
+Script: TypeAlias = Generator[list[Waypoint], Look, None]
+
+
+def put_on(arm: Arm, look: Look, memory: Memory) -> Script:
+    """Set the source onto the target: ``("on", source, target)``."""
+    _, source, target = look.snapshot.goal[0]
+    middle, half = look.middle(source), look.middle(source) - look.low(source)
+    place = look.middle(target)
+    place[2] = look.high(target)[2] + half[2] + _GAP
+    grasp = _choose(arm, look, memory, source, place - middle)
+    if grasp is None:
+        return
+    look = yield _pick(arm, look, source, grasp)
+    if not _held(look, source, middle, grasp, memory):
+        return
+    here, turn = arm.tool(look.qpos, look.base)
+    place[2] += look.middle(source)[2] - look.low(source)[2] - half[2]
+    there = here + place - look.middle(source)
+    over = np.array([*there[:2], max(here[2], there[2] + _ABOVE / 2)])
+    look = yield [*through([over, there], turn, 1.0), *_open(there, turn)]
+    yield through([over], turn, 0.0)
+
+
+def lift(arm: Arm, look: Look, memory: Memory) -> Script:
+    """Lift the source off everything: ``("lifted", source)``."""
+    _, source = look.snapshot.goal[0]
+    middle = look.middle(source)
+    grasp = _choose(arm, look, memory, source, np.array([0, 0, _CARRIED]))
+    if grasp is None:
+        return
+    look = yield _pick(arm, look, source, grasp)
+    if not _held(look, source, middle, grasp, memory):
+        return
+    here, turn = arm.tool(look.qpos, look.base)
+    yield [*through([here + [0, 0, _CARRIED]], turn, 1.0), Waypoint(pose(here, turn), 1.0, hold=5)]
+
+
+def move_near(arm: Arm, look: Look, memory: Memory) -> Script:
+    """Carry the source towards the target until it is near: ``("near", source, target)``."""
+    _, source, target = look.snapshot.goal[0]
+    middle = look.middle(source)
+    grasp = _choose(arm, look, memory, source, _beside(look, source, target))
+    if grasp is None:
+        return
+    look = yield _pick(arm, look, source, grasp)
+    if not _held(look, source, middle, grasp, memory):
+        return
+    here, turn = arm.tool(look.qpos, look.base)
+    way = _beside(look, source, target)
+    over, there = here + [*way[:2], 0.0], here + way + [0, 0, middle[2] - look.middle(source)[2] + _GAP]
+    look = yield [*through([over, there], turn, 1.0), *_open(there, turn)]
+    yield through([over], turn, 0.0)
+
+
+def _beside(look: Look, source: str, target: str) -> np.ndarray:
+    """The way that brings the source next to the target, on the side where it is, [3]."""
+    way = look.middle(target)[:2] - look.middle(source)[:2]
+    distance = np.linalg.norm(way)
+    radii = [np.linalg.norm((look.high(name) - look.low(name))[:2]) / 2 for name in (source, target)]
+    return np.array([*way * max(distance - sum(radii) - _BESIDE, 0.0) / max(distance, 1e-9), 0.0])
+
+
+def open_drawer(arm: Arm, look: Look, memory: Memory) -> Script:
+    """Hook closed fingers behind the upper edge of the drawer's front and pull: ``("open", drawer)``.
+
+    The handles are only drawn: upstream's cabinet has no collision shapes there.
+    """
+    del memory
+    drawer = look.snapshot.parts[look.snapshot.goal[0][-1]]
+    yield drawers.hook_and_pull(arm, look.qpos, look.base, drawer, _OPENED)
+
+
+def close_drawer(arm: Arm, look: Look, memory: Memory) -> Script:
+    """Push the drawer's front with closed fingers: ``("close", drawer)``."""
+    del memory
+    drawer = look.snapshot.parts[look.snapshot.goal[0][-1]]
+    yield drawers.push(arm, look.qpos, look.base, drawer)
+
+
+def put_in(arm: Arm, look: Look, memory: Memory) -> Script:
+    """Open the drawer, then drop the source into it: ``("in", source, drawer)``. Stays when it is in."""
+    _, source, name = look.snapshot.goal[0]
+    drawer = look.snapshot.parts[name]
+    assert drawer.joint is not None, "a drawer has a joint"
+    if drawers.contains(drawer, look.middle(source)):
+        yield [Waypoint(look.snapshot.ee_pose, 0.0, hold=5)]
+        return
+    if drawer.joint.opened < _OPENED / 2:
+        look = yield drawers.hook_and_pull(arm, look.qpos, look.base, drawer, _OPENED)
+    middle, half = look.middle(source), look.middle(source) - look.low(source)
+    place = drawers.opening(look.snapshot.parts[name])
+    place[1] = np.clip(middle[1], place[1] - _ASIDE, place[1] + _ASIDE)
+    place[2] += half[2] + _GAP
+    grasp = _choose(arm, look, memory, source, place - middle)
+    if grasp is None:
+        return
+    look = yield _pick(arm, look, source, grasp)
+    if not _held(look, source, middle, grasp, memory):
+        return
+    here, turn = arm.tool(look.qpos, look.base)
+    there = here + place - look.middle(source)
+    over = np.array([*there[:2], here[2]])
+    look = yield [*through([over, there], turn, 1.0), *_open(there, turn)]
+    yield through([over], turn, 0.0)
+
+
+def _choose(arm: Arm, look: Look, memory: Memory, name: str, carried: np.ndarray) -> Grasp | None:
+    """A grasp of a thing that can be lifted and then moved by ``carried`` [3]."""
+
+    def course(position: np.ndarray, rotation: np.ndarray, approach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        before, lifted = position - _ABOVE * approach, position + [0, 0, _CARRIED]
+        end = position + carried
+        over = np.concatenate([end[:, :2], np.maximum(lifted[:, 2:], end[:, 2:] + _ABOVE / 2)], axis=1)
+        stops = np.stack([*(np.broadcast_to(stop, position.shape) for stop in first), before, position, lifted, over, end], 1)
+        return stops, np.repeat(rotation[:, None], stops.shape[1], axis=1)
+
+    first, ground = _first(arm, look, name), look.low(name)[2]
+    return choose(arm, look.qpos, look.base, look.snapshot.objects[name], ground, course, memory.failed)
+
+
+def _first(arm: Arm, look: Look, name: str) -> list[np.ndarray]:
+    """A hand that is lower than a thing rises before it goes there: positions [3], none or one."""
+    here, _ = arm.tool(look.qpos, look.base)
+    clear = look.high(name)[2] + _ABOVE
+    return [np.array([*here[:2], clear])] if here[2] < look.low(name)[2] else []
+
+
+def _pick(arm: Arm, look: Look, name: str, grasp: Grasp) -> list[Waypoint]:
+    """Go there from where the grasp comes from, close, lift."""
+    at, turn = grasp.position, grasp.rotation
+    here = pose(at, turn)
+    return [
+        *through([*_first(arm, look, name), at - _ABOVE * grasp.approach, at], turn, 0.0),
+        Waypoint(here, 0.0, hold=1),
+        Waypoint(here, 1.0, hold=arm.hand.close_ticks),
+        *through([at + [0, 0, _CARRIED]], turn, 1.0),
+    ]
+
+
+def _open(there: np.ndarray, turn: np.ndarray) -> list[Waypoint]:
+    return [Waypoint(pose(there, turn), 1.0, hold=1), Waypoint(pose(there, turn), 0.0, hold=3)]
+
+
+def _held(look: Look, name: str, before: np.ndarray, grasp: Grasp, memory: Memory) -> bool:
+    """Whether a thing has come along; a grasp that did not hold is remembered."""
+    held = look.middle(name)[2] - before[2] > _FOLLOWED * _CARRIED
+    if not held:
+        memory.failed.append(grasp)
+    return held
+
+
+SCRIPTS: dict[str, Callable[[Arm, Look, Memory], Script]] = {
+    "on": put_on,
+    "lifted": lift,
+    "near": move_near,
+    "open": open_drawer,
+    "close": close_drawer,
+    "in": put_in,
+}
+"""By the first word of a goal."""

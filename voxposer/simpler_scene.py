@@ -1,0 +1,220 @@
+"""SIMPLER's WidowX scenes as VoxPoser looks at them: another hand, other names, other ticks.
+
+A batch of ``simpler/bridge`` comes in; :func:`hands` gives a view of it that speaks the same verbs about VoxPoser's
+hand (third column out of the palm, second the closing direction, grip site between the pads) and the agent's options
+for that robot. Things get the names that the instructions use. Nothing of the task is read beyond what
+:mod:`voxposer.perception` reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from vecenv.actions import GRIPPER
+from vecenv.contract import (
+    BatchEnv,
+    Control,
+    EePoseControl,
+    Egocentric,
+    Metrics,
+    Objects,
+    ObjectsSnapshot,
+    PlanControl,
+    PointCloud,
+    ResetInfo,
+)
+from voxposer.agent import AgentConfig
+from voxposer.grasps import Gripper
+from voxposer.perception import PerceptionConfig, quaternion
+from voxposer.plan import Plan, PlanConfig
+from voxposer.route import RouteConfig
+from voxposer.world import Margins, matrix
+
+SUITE = "simpler/bridge"
+FAMILY = "simpler/"
+_NATIVE = "native"
+# Columns: VoxPoser's hand in the frame of WidowX's tool, which points along its x and opens along its y.
+HAND_IN_TOOL = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+# From a finger joint's position to the distance of its pad from the middle, metres (measured on the collision meshes).
+PAD_OFFSET = 0.011
+# WidowX's fingers and the bar behind them, measured on the collision meshes in the tool's frame, fingers open.
+WIDOWX_GRIPPER = Gripper(
+    half_opening=0.026,
+    half_reach=0.042,
+    finger_half_width=0.0145,
+    tip=0.0156,
+    pad=(-0.0120, 0.0160),
+    palm=0.022,
+    palm_half=(0.0523, 0.0360),
+)
+# What instructions call the models.
+NAMES: Mapping[str, str] = MappingProxyType(
+    {
+        "bridge_spoon_generated_modified": "spoon",
+        "table_cloth_generated_shorter": "towel",
+        "bridge_carrot_generated_modified": "carrot",
+        "bridge_plate_objaverse_larger": "plate",
+        "baked_green_cube_3cm": "green_block",
+        "baked_yellow_cube_3cm": "yellow_block",
+        "eggplant": "eggplant",
+        "dummy_sink_target_plane": "yellow_basket",
+        "sink": "sink",
+    }
+)
+# How far the tool is from the robot's base when an episode begins; the robot looks along -x. Metres.
+_HOME_REACH = -0.28
+# Samples of a table that the snapshot has no points of: half a side and distance, metres.
+_TABLE_HALF, _TABLE_STEP = 0.5, 0.1
+
+
+class NoHandView(ValueError):
+    """VoxPoser has no view of this suite's robot; the message says of which it has."""
+
+
+def widowx_config(passes: int = 3) -> AgentConfig:
+    """The agent's options for WidowX at 5 ticks a second, whose episodes last 60 or 120 ticks.
+
+    Args:
+        passes: how often an instruction is planned.
+    """
+    margins = Margins(
+        gripper=WIDOWX_GRIPPER, above=0.05, corridor=0.06, narrow=0.02, easy_reach=0.40, least_room=0.002, retreat=0.06
+    )
+    # Empty, closed fingers stop 8 mm apart.
+    perception = PerceptionConfig(
+        margins=margins, held_box=(0.018, 0.008, 0.020), closed_gap=0.0095, home_reach=_HOME_REACH
+    )
+    plan = PlanConfig(hold_ticks=3, settle=1, full_speed=0.03)
+    # High above the table's far side the hand cannot point down: the wrist ends at 1.79 rad.
+    route = RouteConfig(over=0.02, corridor=0.06, approach=0.03)
+    return AgentConfig(perception=perception, route=route, plan=plan, passes=passes, idle_ticks=10)
+
+
+def hands(env: BatchEnv, suite: str, config: AgentConfig) -> tuple[BatchEnv, AgentConfig]:
+    """An environment and options for the agent: both as they are, or for ``simpler/bridge`` a :class:`HandView` of it.
+
+    Raises:
+        NoHandView: another robot of SIMPLER.
+    """
+    if not suite.startswith(FAMILY):
+        return env, config
+    if suite != SUITE:
+        raise NoHandView(f"voxposer knows Panda's and WidowX's hands: {SUITE} of SIMPLER's suites, not {suite}")
+    return HandView(env), widowx_config(config.passes)
+
+
+class HandView:
+    """A batch of ``simpler/bridge`` with VoxPoser's hand and names; see ``vecenv.contract`` for the verbs.
+
+    ``step_continuous`` takes LIBERO's gripper sign, +1 closes, as the agent gives it.
+
+    Args:
+        env: the batch.
+    """
+
+    def __init__(self, env: BatchEnv) -> None:
+        self.env, self.num_envs = env, env.num_envs
+        option = getattr(getattr(env, "config", None), "gripper", _NATIVE)
+        self._gripper = GRIPPER[SUITE if option == _NATIVE else option]
+
+    def reset(self) -> ResetInfo:
+        """Make every slot live."""
+        return self.env.reset()
+
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+        """Choose what each slot runs next."""
+        self.env.set_episodes(tasks=tasks, episodes=episodes)
+
+    def evaluate(self) -> Metrics:
+        """Verdicts."""
+        return self.env.evaluate()
+
+    def observe_egocentric(self) -> Egocentric:
+        """Cameras and joints."""
+        return self.env.observe_egocentric()
+
+    def close(self) -> None:
+        """Release the simulator."""
+        self.env.close()
+
+    def step_continuous(self, actions: Any) -> Control:
+        """Advance; the gripper column is LIBERO's."""
+        column = self._gripper
+        actions = np.array(actions, float)
+        actions[..., 6] = np.where(actions[..., 6] > 0, column.closed, column.open)
+        return self.env.step_continuous(actions)
+
+    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+        """Drive the hand to poses, [B, 8]; what comes back speaks of the hand too."""
+        poses = np.array(poses, float)
+        if poses.size:
+            poses[..., :7] = tool_poses(poses[..., :7])
+        control = self.env.step_ee_pose(poses, hold_steps)
+        return replace(control, final_pose=hand_poses(control.final_pose))
+
+    def step_waypoints(self, plan: Plan, max_misses: int | None = None) -> PlanControl:
+        """Follow a plan of the hand."""
+        control = self.env.step_waypoints(plan._replace(poses=tool_poses(plan.poses)), max_misses=max_misses)
+        return replace(control, final_pose=hand_poses(control.final_pose))
+
+    def observe_objects(self, points: str = "surface") -> Objects:
+        """Ground truth about the hand, under the names of the instructions."""
+        seen = self.env.observe_objects(points)
+        return replace(seen, snapshot=tuple(each and view(each) for each in seen.snapshot))
+
+
+def view(snapshot: ObjectsSnapshot) -> ObjectsSnapshot:
+    """A snapshot of ``simpler/bridge`` with the pose of the hand, the distances of its pads, and names as spoken."""
+    left, right = np.maximum(snapshot.gripper - PAD_OFFSET, 0.0)
+    return replace(
+        snapshot,
+        names=tuple(map(called, snapshot.names)),
+        objects={called(name): cloud for name, cloud in snapshot.objects.items()},
+        poses={called(name): pose for name, pose in snapshot.poses.items()},
+        goal=tuple((verb, *map(called, things)) for verb, *things in snapshot.goal),
+        targets=tuple(map(called, snapshot.targets)),
+        movable=tuple(map(called, snapshot.movable)),
+        scene=_with_table(snapshot),
+        ee_pose=hand_poses(snapshot.ee_pose),
+        gripper=np.array([left, -right]),
+    )
+
+
+def called(name: str) -> str:
+    """What instructions call a model."""
+    return NAMES.get(name, name)
+
+
+def tool_poses(poses: np.ndarray) -> np.ndarray:
+    """Poses of the hand, [..., 7], as poses of WidowX's tool."""
+    return _turned(poses, HAND_IN_TOOL.T)
+
+
+def hand_poses(poses: np.ndarray) -> np.ndarray:
+    """Poses of WidowX's tool, [..., 7], as poses of the hand."""
+    return _turned(poses, HAND_IN_TOOL)
+
+
+def _turned(poses: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    flat = np.asarray(poses, float).reshape(-1, 7)
+    quats = np.array([quaternion(matrix(quat) @ turn) for quat in flat[:, 3:]])
+    return np.concatenate([flat[:, :3], quats.reshape(-1, 4)], axis=1).reshape(np.shape(poses))
+
+
+def _with_table(snapshot: ObjectsSnapshot) -> PointCloud:
+    """The scene; where it has nothing but the things, with the table that they stand on."""
+    named = sum(len(cloud.points) for cloud in snapshot.objects.values())
+    if len(snapshot.scene.points) > named:
+        return snapshot.scene
+    low = min(float(cloud.points[:, 2].min()) for cloud in snapshot.objects.values())
+    ticks = np.arange(-_TABLE_HALF, _TABLE_HALF + _TABLE_STEP / 2, _TABLE_STEP)
+    x, y = np.meshgrid(*(ticks + snapshot.workspace[:, axis].mean() for axis in (0, 1)))
+    table = np.stack([x.ravel(), y.ravel(), np.full(x.size, low)], axis=1)
+    normals = np.tile([0.0, 0.0, 1.0], (len(table), 1))
+    scene = snapshot.scene
+    return PointCloud(np.concatenate([scene.points, table]), np.concatenate([scene.normals, normals]))
