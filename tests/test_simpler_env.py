@@ -174,6 +174,23 @@ def test_a_chunk_stops_at_the_budget_and_finished_slots_ignore_steps(small: Path
     env.close()
 
 
+@pytest.mark.parametrize("task", [CARROT, COKE])
+def test_an_episode_repeats_exactly_whatever_ran_before_or_beside_it(tree: Path, task: str) -> None:
+    actions = np.random.default_rng(0).normal(0, 0.03, (3, 6, 7))
+    actions[..., 6] = np.sign(actions[..., 6])
+    together, alone = batch(tree, task, range(3)), batch(tree, task, [2])
+    first = [
+        env.step_continuous(part) and env.state().qpos for env, part in ((together, actions), (alone, actions[2:]))
+    ]
+    np.testing.assert_array_equal(first[0][2], first[1][0])
+    together.set_episodes(episodes=[2, 1, 0])
+    together.reset()
+    together.step_continuous(actions[::-1])
+    np.testing.assert_array_equal(together.state().qpos[::-1], first[0])
+    together.close()
+    alone.close()
+
+
 def test_bad_numbers_are_mended_and_reported(carrot: SimplerEnv) -> None:
     actions = np.zeros((2, 7))
     actions[1] = [np.nan, np.inf, 0, 0, 0, 2.0, 0]
@@ -405,6 +422,19 @@ def test_step_ee_pose_holds_and_refuses_bad_poses(carrot: SimplerEnv) -> None:
     assert control.step_count.tolist() == [3, 0]
     assert control.error == ("", "pose is not finite")
     np.testing.assert_allclose(carrot.observe_egocentric().state[0, 6:8], 0.015, atol=1e-3)
+
+
+def test_a_slot_that_waits_for_others_stays_where_it_is(carrot: SimplerEnv) -> None:
+    tool = carrot.step_ee_pose([]).final_pose
+    poses = np.zeros((2, 8, 7))
+    poses[..., 3] = 1.0
+    poses[:, 0] = tool
+    poses[1] = tool[1] + np.linspace(0, 0.1, 8)[:, None] * [0, 0, 1, 0, 0, 0, 0]
+    valid = np.array([[True] + [False] * 7, [True] * 8])
+    plan = {"poses": poses, "grip": np.zeros((2, 8)), "hold": np.zeros((2, 8), int), "valid": valid}
+    before = carrot.step_waypoints(plan).final_pose[0]
+    after = carrot.step_ee_pose(np.concatenate([tool, np.zeros((2, 1))], axis=1), hold_steps=3).final_pose[0]
+    np.testing.assert_allclose(after[:3], before[:3], atol=1e-3)
 
 
 def test_step_waypoints_follows_a_plan_of_unequal_lengths(carrot: SimplerEnv) -> None:

@@ -38,7 +38,8 @@ class ResetInfo:
 
     Attributes:
         instruction: language instruction of each slot, length B.
-        episode_id: ``"{suite}/{task}/{episode}"`` of each slot, length B.
+        episode_id: ``"{suite}/{task}/{episode}"`` of each slot, length B; the task is its index in LIBERO, its name in
+            SIMPLER.
         suite: suite name of the environment.
         task_id: task index of each slot, int [B].
         max_steps: step budget of each slot in control ticks, int [B].
@@ -62,7 +63,9 @@ class Control:
         success: verdict of each slot at its last executed tick, bool [B].
         step_index: control ticks executed in the episode so far, int [B].
         info: diagnostics. Always has ``mended`` (bool [B], an action held NaN, infinities or values out of range),
-            ``fault`` (tuple of B strings, empty when healthy) and ``ticks`` (int [B], ticks executed in this call).
+            ``fault`` (tuple of B strings, empty when healthy) and ``ticks`` (int [B], ticks executed in this call);
+            SIMPLER's also ``parts`` (what its success is made of, a mapping a slot) and ``stand_ins`` (sentences about
+            missing files, a tuple a slot).
     """
 
     reward: np.ndarray
@@ -123,7 +126,7 @@ class CameraView:
     Attributes:
         intrinsics: camera matrices [B, 3, 3]: ``intrinsics @ p`` is proportional to (x, y, 1) for a point p in the
             camera's frame; pixel centres are at whole numbers, x counts columns and y rows from the top left.
-            The x entry is negative: delivered images are mirrored, as VLA training data are.
+            LIBERO's x entry is negative: its delivered images are mirrored, as VLA training data are.
         pos: position in metres, world frame, [B, 3].
         mat: rotation to the world frame, [B, 3, 3]; columns are the camera's right, down and forward.
     """
@@ -175,9 +178,11 @@ class Egocentric:
     """``observe_egocentric``'s return. Mappings are by camera and may render when they are first read.
 
     Attributes:
-        state: 8-D proprioception, float32 [B, 8]: end-effector position, axis-angle orientation, two finger positions.
-        images: camera images, uint8 [B, H, W, 3], rotated by 180 degrees against upstream's observations, as VLA
-            training data are; empty when the environment does not render.
+        state: proprioception, float32. LIBERO [B, 8]: end-effector position, axis-angle orientation, two finger
+            positions. SIMPLER [B, 23] (WidowX) or [B, 29] (Google Robot): joint positions, joint velocities, pose of
+            the base (xyz, wxyz).
+        images: camera images, uint8 [B, H, W, 3]. LIBERO's are rotated by 180 degrees against upstream's observations,
+            as VLA training data are; SIMPLER's are as upstream's. Empty when the environment does not render.
         depths: distances from the camera's plane, metres, float32 [B, H, W], pixel by pixel with ``images``.
         segmentations: index into ``instances[slot]`` of what each pixel shows, int16 [B, H, W]; likewise.
         views: where the cameras are.
@@ -205,7 +210,10 @@ class Egocentric:
 
     @property
     def wrist_image(self) -> np.ndarray:
-        """The wrist camera's image, [B, H, W, 3]; raises ``ImagesUnavailable`` where nothing renders."""
+        """The wrist camera's image, [B, H, W, 3]; raises ``ImagesUnavailable`` where nothing renders.
+
+        SIMPLER has no wrist camera: there it is None, and ``observation`` is the third-person image alone.
+        """
         return _camera(self.images, "wrist", "image")
 
     @property

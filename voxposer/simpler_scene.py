@@ -89,7 +89,8 @@ def widowx_config(passes: int = 3) -> AgentConfig:
     perception = PerceptionConfig(
         margins=margins, held_box=(0.018, 0.008, 0.020), closed_gap=0.0095, home_reach=_HOME_REACH
     )
-    plan = PlanConfig(hold_ticks=3, settle=1, full_speed=0.03)
+    # Waypoints are left within 1 cm and 0.1 rad, and a hand tilted so far loses a spoon: 3 more ticks at each stop.
+    plan = PlanConfig(hold_ticks=3, settle=3, full_speed=0.03)
     # High above the table's far side the hand cannot point down: the wrist ends at 1.79 rad.
     route = RouteConfig(over=0.02, corridor=0.06, approach=0.03)
     return AgentConfig(perception=perception, route=route, plan=plan, passes=passes, idle_ticks=10)

@@ -1,8 +1,8 @@
 """Pull and push drawers with closed fingers, where the arm can: waypoints from a drawer's shape.
 
-In: a drawer as a ``Part`` (surface points, joint), and the arm's posture. Out: waypoints. Above the front of each of the
-cabinet's drawers is a gap of 10 cm; slanting fingers reach through it, press on the front's upper edge from behind, and
-take it along. Where along the edge and at which angles is decided by rehearsing all of them.
+In: a drawer as a ``Part`` (surface points, joint), and the arm's posture. Out: waypoints. Above the front of each of
+the cabinet's drawers is a gap of 10 cm; slanting fingers reach through it, press on the front's upper edge from behind,
+and take it along. Where along the edge and at which angles is decided by rehearsing all of them.
 """
 
 from __future__ import annotations

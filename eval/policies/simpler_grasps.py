@@ -28,7 +28,7 @@ _SKIN = 0.006
 # Fingers stay so far above what the thing stands on, metres.
 _GROUND = 0.003
 # So many alternatives are rehearsed at once, and so many times if none will do.
-_REHEARSED, _ROUNDS = 48, 8
+_REHEARSED, _ROUNDS = 48, 12
 # A grasp with this much room at the joints' limits is as good as one with more, radians.
 _ROOMY = 0.15
 # What it costs to have no room at all.
@@ -37,12 +37,19 @@ _STRAIN = 3.0
 
 @dataclass(frozen=True)
 class Grasp:
-    """A pose of the tool: ``position`` [3], ``rotation`` [3, 3], ``approach`` [3]; ``room`` as ``Arm.rehearse`` has it."""
+    """A pose of the tool.
+
+    Attributes:
+        position: metres, world frame, [3]. rotation: [3, 3]. approach: where the hand comes from, unit vector [3].
+        room: at the joints' limits, radians, as ``Arm.rehearse`` has it.
+        cost: the less the better; up to about 2 it holds.
+    """
 
     position: np.ndarray
     rotation: np.ndarray
     approach: np.ndarray
     room: float
+    cost: float
 
 
 @dataclass(frozen=True)
@@ -81,18 +88,19 @@ def choose(
     cost = _cost(arm, qpos, base, offers, failed)
     ranked = np.argsort(cost, kind="stable")[: _REHEARSED * _ROUNDS]
     ranked = ranked[np.isfinite(cost[ranked])]
-    found: list[tuple[float, Grasp]] = []
+    found: list[Grasp] = []
     for begin in range(0, len(ranked), _REHEARSED):
         best = ranked[begin : begin + _REHEARSED]
         stops, turns = course(offers.position[best], offers.rotation[best], offers.approach[best])
         room, _ = arm.rehearse(qpos, base, stops, turns)
         total = cost[best] + _STRAIN * np.clip(_ROOMY - np.maximum(room, -10.0), 0.0, None) / _ROOMY
         one = int(np.argmin(total))
-        parts = (getattr(offers, name)[best[one]] for name in ("position", "rotation", "approach"))
-        found.append((float(total[one]), Grasp(*parts, float(room[one]))))
+        at = best[one]
+        pose = offers.position[at], offers.rotation[at], offers.approach[at]
+        found.append(Grasp(*pose, room=float(room[one]), cost=float(total[one])))
         if room[one] >= _ROOMY:
             break
-    return min(found, key=lambda pair: pair[0])[1] if found else None
+    return min(found, key=lambda grasp: grasp.cost, default=None)
 
 
 def approaches() -> np.ndarray:
@@ -116,14 +124,12 @@ def _offers(hand: Hand, cloud: PointCloud, ground: float) -> _Offers:
     position = position + np.minimum(depth, hand.palm - _reach(cloud.points, approach))[:, None] * approach
     # The lowest corner of the fingers is at the tip of the tool, or beside it when the hand slants.
     slant = np.sqrt(1 - approach[:, 2] ** 2)
-    low = position[:, 2] + hand.tip * approach[:, 2] - hand.thickness * slant
+    low = position[:, 2] + hand.tip * approach[:, 2] - hand.edge * slant
     position -= np.minimum(low - ground - _GROUND, 0.0)[:, None] * np.array([0.0, 0.0, 1.0])
     return _Offers(position, hand.rotation(approach, opening), approach, opening, width, square)
 
 
-def _centred(
-    cloud: PointCloud, approach: np.ndarray, opening: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _centred(cloud: PointCloud, approach: np.ndarray, opening: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centre of what lies between the fingers [C, 3], its width [C], and how squarely they meet it, [C]: 1 flat on."""
     points = cloud.points
     along = np.cross(approach, opening)
@@ -159,8 +165,8 @@ def _cost(arm: Arm, qpos: np.ndarray, base: np.ndarray, offers: _Offers, failed:
     _, facing = arm.tool(qpos, base)
     turn = np.linalg.norm(rotvec_from_rotation(offers.rotation @ facing.T), axis=1)
     tilt = np.arccos(np.clip(-offers.approach[:, 2], -1, 1))
-    cost = 0.5 * turn + tilt + offers.width / arm.hand.widest
-    cost += 5.0 * (1 - offers.square) + 2.5 * np.abs(offers.opening[:, 2])
+    cost = 0.2 * turn + tilt + offers.width / arm.hand.widest
+    cost += 8.0 * (1 - offers.square) + 2.0 * np.abs(offers.opening[:, 2])
     for grasp in failed:
         unlike = np.linalg.norm(rotvec_from_rotation(offers.rotation @ grasp.rotation.T), axis=1)
         cost += np.maximum(0.0, 1.0 - unlike / 0.5)

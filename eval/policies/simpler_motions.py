@@ -30,16 +30,22 @@ _BESIDE = 0.02
 _OPENED = 0.21
 # What is put into a drawer goes in at most so far beside its middle, metres.
 _ASIDE = 0.15
+# A grasp that costs more than this (``simpler_grasps``) is not tried where a thing can be pushed as well.
+_DOUBTFUL = 2.0
+# Pushing: fingers come down so far behind a thing, and move so high above what it stands on, metres; angles from the
+# vertical and sideways that are tried, radians; room that is enough, radians, and what an angle costs.
+_BEHIND, _SKIMMING = 0.05, 0.02
+_SWEEP_TILTS, _SWEEP_AZIMUTHS = np.deg2rad([0.0, 10.0, 20.0, 30.0, 40.0]), np.deg2rad([-40.0, -20.0, 0.0, 20.0, 40.0])
+_ROOM_ENOUGH, _PREFER_UPRIGHT = 0.2, 0.3
 
 
 @dataclass(frozen=True)
 class Look:
-    """One slot now: ground truth, the joints ``qpos`` [N], the root's world pose ``base`` [7], and ticks that are left."""
+    """One slot now: ground truth, the joints ``qpos`` [N], and the root's world pose ``base`` [7]."""
 
     snapshot: ObjectsSnapshot
     qpos: np.ndarray
     base: np.ndarray
-    left: int
 
     def points(self, name: str) -> np.ndarray:
         """Points on the surface of a thing, [n, 3]."""
@@ -159,7 +165,8 @@ def put_in(arm: Arm, look: Look, memory: Memory) -> Script:
     place[1] = np.clip(middle[1], place[1] - _ASIDE, place[1] + _ASIDE)
     place[2] += half[2] + _GAP
     grasp = _choose(arm, look, memory, source, place - middle)
-    if grasp is None:
+    if grasp is None or grasp.cost > _DOUBTFUL:
+        yield _sweep(arm, look, source, place)
         return
     look = yield _pick(arm, look, source, grasp)
     if not _held(look, source, middle, grasp, memory):
@@ -171,6 +178,23 @@ def put_in(arm: Arm, look: Look, memory: Memory) -> Script:
     yield through([over], turn, 0.0)
 
 
+def _sweep(arm: Arm, look: Look, name: str, place: np.ndarray) -> list[Waypoint]:
+    """Push a thing with closed fingers, from behind, over the edge of what it stands on, towards ``place`` [3]."""
+    low, high = look.low(name), look.high(name)
+    behind = np.array([low[0] - _BEHIND, (low[1] + high[1]) / 2, low[2] + _SKIMMING])
+    end = np.array([place[0], *behind[1:]])
+    stops = [*_first(arm, look, name), behind + [0, 0, high[2] - low[2] + _ABOVE], behind, end]
+    tilts, azimuths = (grid.ravel() for grid in np.meshgrid(_SWEEP_TILTS, _SWEEP_AZIMUTHS))
+    approach = np.stack([-np.sin(tilts) * np.cos(azimuths), np.sin(tilts) * np.sin(azimuths), -np.cos(tilts)], axis=1)
+    opening = np.cross([1.0, 0.0, 0.0], approach)
+    opening = np.concatenate([opening, -opening]) / np.linalg.norm(np.tile(opening, (2, 1)), axis=1, keepdims=True)
+    turns = arm.hand.rotation(np.concatenate([approach, approach]), opening)
+    ways = np.repeat(np.array(stops)[None], len(turns), axis=0)
+    room, _ = arm.rehearse(look.qpos, look.base, ways, np.repeat(turns[:, None], len(stops), axis=1))
+    best = int(np.argmax(np.minimum(room, _ROOM_ENOUGH) - _PREFER_UPRIGHT * np.tile(tilts, 2)))
+    return through(stops, turns[best], 1.0)
+
+
 def _choose(arm: Arm, look: Look, memory: Memory, name: str, carried: np.ndarray) -> Grasp | None:
     """A grasp of a thing that can be lifted and then moved by ``carried`` [3]."""
 
@@ -178,7 +202,9 @@ def _choose(arm: Arm, look: Look, memory: Memory, name: str, carried: np.ndarray
         before, lifted = position - _ABOVE * approach, position + [0, 0, _CARRIED]
         end = position + carried
         over = np.concatenate([end[:, :2], np.maximum(lifted[:, 2:], end[:, 2:] + _ABOVE / 2)], axis=1)
-        stops = np.stack([*(np.broadcast_to(stop, position.shape) for stop in first), before, position, lifted, over, end], 1)
+        stops = np.stack(
+            [*(np.broadcast_to(stop, position.shape) for stop in first), before, position, lifted, over, end], 1
+        )
         return stops, np.repeat(rotation[:, None], stops.shape[1], axis=1)
 
     first, ground = _first(arm, look, name), look.low(name)[2]
@@ -198,7 +224,7 @@ def _pick(arm: Arm, look: Look, name: str, grasp: Grasp) -> list[Waypoint]:
     here = pose(at, turn)
     return [
         *through([*_first(arm, look, name), at - _ABOVE * grasp.approach, at], turn, 0.0),
-        Waypoint(here, 0.0, hold=1),
+        Waypoint(here, 0.0, hold=arm.hand.settle_ticks),
         Waypoint(here, 1.0, hold=arm.hand.close_ticks),
         *through([at + [0, 0, _CARRIED]], turn, 1.0),
     ]

@@ -44,8 +44,8 @@ class Hand:
         depth: where the tool's origin belongs when something is grasped, so far beyond its centre: widths, and the
             depth for each, where the fingers meet it with their pads; linear between.
         palm: things reach at most so far into the hand, from the tool's origin back.
-        thickness: of the closed fingers, across ``opening``, half of it.
-        close_ticks: control ticks that closing takes.
+        thickness: of the closed fingers, across ``opening``, half of it. edge: likewise of their tips.
+        close_ticks: control ticks that closing takes. settle_ticks: ticks to come to rest before it.
     """
 
     approach: int
@@ -55,7 +55,9 @@ class Hand:
     depth: tuple[tuple[float, ...], tuple[float, ...]]
     palm: float
     thickness: float
+    edge: float
     close_ticks: int
+    settle_ticks: int
 
     def rotation(self, approach: np.ndarray, opening: np.ndarray) -> np.ndarray:
         """Rotations of the tool, [..., 3, 3], from where it points and where it opens to, unit vectors [..., 3]."""
@@ -77,7 +79,9 @@ HANDS: Mapping[str, Hand] = MappingProxyType(
             depth=((0.0,), (0.0,)),
             palm=0.022,
             thickness=0.015,
+            edge=0.015,
             close_ticks=3,
+            settle_ticks=1,
         ),
         GOOGLE_ROBOT.name: Hand(
             approach=2,
@@ -87,7 +91,9 @@ HANDS: Mapping[str, Hand] = MappingProxyType(
             depth=((0.04, 0.076, 0.10), (0.01, 0.025, 0.045)),
             palm=0.07,
             thickness=0.028,
+            edge=0.010,
             close_ticks=6,
+            settle_ticks=3,
         ),
     }
 )
@@ -141,8 +147,9 @@ class Arm:
         and the least room on the way [C]."""
         start, facing = self.chain.pose(joints)
         way, twist = goal - start, rotvec_from_rotation(turn @ facing.swapaxes(1, 2))
-        strides = np.maximum(np.linalg.norm(way, axis=1) / _STRIDE, 1e-9), np.maximum(
-            np.linalg.norm(twist, axis=1) / _TURN, 1e-9
+        strides = (
+            np.maximum(np.linalg.norm(way, axis=1) / _STRIDE, 1e-9),
+            np.maximum(np.linalg.norm(twist, axis=1) / _TURN, 1e-9),
         )
         room = np.full(len(joints), np.inf)
         for tick in range(1, int(np.ceil(max(strides[0].max(), strides[1].max()))) + 1):

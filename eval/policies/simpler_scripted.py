@@ -44,7 +44,6 @@ class SimplerScriptedPolicy:
     def __init__(self, attempts: int = 8) -> None:
         self.attempts = attempts
         self._slots: list[_Slot] = []
-        self._budget = np.zeros(0, int)
         self._arm: Arm | None = None
 
     def reset(self, env: BatchEnv, info: ResetInfo) -> None:
@@ -57,7 +56,6 @@ class SimplerScriptedPolicy:
             raise TypeError(f"{self.name} works on SIMPLER's suites, not on {info.suite}")
         self._arm = Arm(env.robot, env.config.assets or assets.simpler_root())
         self._slots = [_Slot() for _ in range(env.num_envs)]
-        self._budget = info.max_steps
 
     def act(self, env: BatchEnv) -> Control:
         """The next few waypoints of every slot, followed to their end."""
@@ -72,10 +70,10 @@ class SimplerScriptedPolicy:
         """What each slot looks like; None where there is no ground truth."""
         state = env.observe_egocentric().state.astype(float)
         assert self._arm is not None, "call reset() first"
-        dof, left = self._arm.robot.dof, self._budget - env.evaluate().num_steps
+        dof = self._arm.robot.dof
         return [
-            Look(snapshot, row[:dof], row[2 * dof :], int(ticks)) if snapshot is not None else None
-            for snapshot, row, ticks in zip(env.observe_objects().snapshot, state, left, strict=True)
+            Look(snapshot, row[:dof], row[2 * dof :]) if snapshot is not None else None
+            for snapshot, row in zip(env.observe_objects().snapshot, state, strict=True)
         ]
 
     def _next(self, slot: _Slot, look: Look | None) -> list[Waypoint]:
