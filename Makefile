@@ -29,12 +29,12 @@ system: ## Install what pictures need of the system (GL, Vulkan), where apt and 
 	@scripts/system.sh $(SYSTEM)
 
 eval: $(VENV)/.installed-eval ## Evaluate pick_place on libero_object: 10 tasks x 5 episodes, table and results folder
-	@scripts/system.sh check
+	@scripts/system.sh release
 	@echo "==> vecenv eval $(EVAL_ARGS)"
 	@$(RUN)/vecenv eval $(EVAL_ARGS)
 
 test: $(VENV)/.installed-dev ## Run the tests, all but those marked heavy
-	@scripts/system.sh check
+	@scripts/system.sh release
 	@echo "==> pytest, $(WORKERS) processes, without the tests marked heavy"
 	@$(PYTEST) -m "not heavy" $(TEST_ARGS)
 

@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
 # The system libraries that pictures need: GL (EGL, OSMesa) for LIBERO's, Vulkan for SIMPLER's. Physics needs none.
-# Usage: scripts/system.sh install | dry | check
+# Usage: scripts/system.sh install | dry | check | release
 #   install  install what is missing, where this is root on Debian or Ubuntu; else print the commands
 #   dry      print the commands
 #   check    say in two lines what is missing, if anything is; always succeeds
+#   release  install what the release itself has of it, where this is root, then check: what comes with `make eval` and
+#            `make test`; a newer Mesa out of backports replaces a dozen packages, so it is left to `make system`
 # Environment: APT_SOURCES, folder for a new apt source; OS_RELEASE, a file; VULKAN_ICDS, folders with drivers.
 set -euo pipefail
 PATH=$PATH:/usr/sbin:/sbin
@@ -35,6 +37,22 @@ if ! gpu_driver; then
   if [[ -z $have ]] || older "$have"; then mesa=mesa-vulkan-drivers; fi
 fi
 [[ ${#plain[@]} -gt 0 || -n $mesa ]] || { [[ $mode == check ]] || echo "==> GL and Vulkan are there"; exit 0; }
+
+apt="env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends"
+if [[ $mode == release ]]; then
+  if [[ ${#plain[@]} -gt 0 && $(id -u) -eq 0 ]] && command -v apt-get >/dev/null; then
+    apt-get update >/dev/null || echo "==> apt-get update failed; going on"
+    lacking=()
+    for package in "${plain[@]}"; do
+      [[ -n $(candidate "$package") ]] || continue
+      echo "==> $apt $package"
+      $apt "$package" >/dev/null || lacking+=("$package")
+    done
+    plain=(${lacking[@]+"${lacking[@]}"})
+    [[ ${#plain[@]} -gt 0 || -n $mesa ]] || exit 0
+  fi
+  mode=check
+fi
 
 missing="${plain[*]:-}${mesa:+ $mesa (Mesa $needed or newer)}"
 if [[ $mode == check ]]; then
@@ -71,7 +89,6 @@ if [[ -n $mesa ]]; then
     note="the newest $mesa here is ${offered:-none}: SIMPLER's pictures need $needed, so a GPU's driver or a newer release"
   fi
 fi
-apt="env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends"
 [[ ${#wanted[@]} -eq 0 ]] || commands+=("$apt ${wanted[*]}")
 [[ -z ${wanted_backports:-} ]] || commands+=("$apt -t bookworm-backports $wanted_backports")
 

@@ -96,6 +96,26 @@ def test_bookworm_gets_mesa_from_backports_of_its_own_mirror(machine: Machine) -
     ]
 
 
+def test_make_test_and_make_eval_bring_what_the_release_has(machine: Machine) -> None:
+    machine.has(libraries=("libEGL.so.1",), installed={}, offered=OFFERED, root=True, release="bookworm")
+    done = machine.run("release")
+    assert done.returncode == 0, done.stderr
+    assert machine.calls == [
+        "update",
+        "install -y --no-install-recommends libosmesa6",
+        "install -y --no-install-recommends libvulkan1",
+    ]
+    assert "lack system libraries: mesa-vulkan-drivers (Mesa 24.3 or newer)" in done.stdout
+
+
+def test_without_root_they_only_say_what_is_missing(machine: Machine) -> None:
+    machine.has(libraries=(), installed={}, offered=OFFERED, root=False, release="bookworm")
+    done = machine.run("release")
+    assert done.returncode == 0, done.stderr
+    assert machine.calls == []
+    assert "libegl1 libgl1-mesa-dri libosmesa6 libvulkan1 mesa-vulkan-drivers" in done.stdout
+
+
 def test_a_dry_run_prints_the_same_commands_and_runs_none(machine: Machine) -> None:
     machine.has(libraries=("libEGL.so.1",), installed={}, offered=OFFERED, root=True, release="bookworm")
     done = machine.run("dry")
