@@ -24,7 +24,7 @@ import vecenv
 from vecenv.machine import usable_cores
 from vecenv.render.options import RenderConfig
 
-TASKS = [("libero_object", 0), ("libero_spatial", 0), ("libero_goal", 0), ("libero_10", 8)]
+TASKS = [("libero_object", 0), ("libero_spatial", 0), ("libero_10", 0)]
 SIZE = 256
 
 

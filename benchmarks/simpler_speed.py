@@ -16,10 +16,11 @@ import common
 import numpy as np
 
 from vecenv.simpler.env import SimplerEnv, make
-from vecenv.simpler.tasks import TASKS
+from vecenv.simpler.tasks import NUM_EPISODES, TASKS
 
 PAIR = ("widowx_carrot_on_plate", "google_robot_pick_coke_can")
 TICKS = 25
+BATCH_TICKS = 12
 SCALE = np.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1, 1.0])
 
 _PEER = """
@@ -38,12 +39,13 @@ print(ticks / (time.process_time() - begin))
 """
 
 
-def actions(slots: int) -> np.ndarray:
-    return np.random.RandomState(0).uniform(-1, 1, (slots, TICKS, 7)) * SCALE
+def actions(slots: int, ticks: int = TICKS) -> np.ndarray:
+    return np.random.RandomState(0).uniform(-1, 1, (slots, ticks, 7)) * SCALE
 
 
 def running(task: str, slots: int, workers: int) -> SimplerEnv:
-    env = make(TASKS[task].suite, task=task, episodes=range(slots), num_workers=workers)
+    episodes = [slot % NUM_EPISODES for slot in range(slots)]
+    env = make(TASKS[task].suite, task=task, episodes=episodes, num_workers=workers)
     env.reset()
     env.step_continuous(np.zeros((slots, 7)))
     return env
@@ -75,10 +77,10 @@ def batch(task: str, slots: int, workers: int) -> float:
     """Control ticks of all slots a wall second, without pictures."""
     env = running(task, slots, workers)
     begin = time.perf_counter()
-    env.step_continuous(actions(slots))
-    rate = slots * TICKS / (time.perf_counter() - begin)
+    env.step_continuous(actions(slots, BATCH_TICKS))
+    rate = slots * BATCH_TICKS / (time.perf_counter() - begin)
     env.close()
-    return rate
+    return round(rate, 1)
 
 
 def compare(peer: str | None, pictures: bool, repeats: int) -> list[dict[str, Any]]:
@@ -101,10 +103,12 @@ def main() -> None:
     parser.add_argument("--slots", type=int, nargs="*", default=[1, 8, 32, 64])
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--only-batches", action="store_true", help="leave one slot against upstream out")
     chosen = parser.parse_args()
-    rows = compare(chosen.peer, False, chosen.repeats)
-    rows += compare(chosen.peer, True, chosen.repeats) if chosen.pictures else []
-    common.report("simpler_speed", rows, title="SIMPLER, one slot: control ticks a CPU second")
+    if not chosen.only_batches:
+        rows = compare(chosen.peer, False, chosen.repeats)
+        rows += compare(chosen.peer, True, chosen.repeats) if chosen.pictures else []
+        common.report("simpler_speed", rows, title="SIMPLER, one slot: control ticks a CPU second")
     batches = [
         {"task": task, "slots": slots, "workers": workers, "ticks_per_wall_second": batch(task, slots, workers)}
         for task in PAIR

@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--task", default="0")
     parser.add_argument("--episodes", default="all")
     options = parser.parse_args()
-    run(options, 1, "0")
+    run(options, 1, "0-0")
     together, seconds = run(options, 50, options.episodes)
     alone, one_by_one = run(options, 1, options.episodes)
     pairs = list(zip(together.records, alone.records, strict=True))

@@ -15,7 +15,7 @@ def video_command(
     max_steps: int = typer.Option(400, min=1, help="Step budget of an episode."),
     camera: list[str] = typer.Option(["agentview"], help="A camera; repeatable, side by side."),
     size: int = typer.Option(256, min=16, help="Height and width of an image, pixels."),
-    lod: str = typer.Option("exact", help="exact, or fast: simplified meshes."),
+    lod: str = typer.Option("exact", help="exact, original (all triangles) or fast (simplified meshes)."),
     out: Path = typer.Option(Path("video.mp4"), help="The file to write."),
 ) -> None:
     """Film a policy: all episodes of a batch in one mp4, titled, framed by verdict."""

@@ -10,7 +10,9 @@ from __future__ import annotations
 import ctypes
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,11 +20,13 @@ from vecenv.libero import suites
 from vecenv.libero.scene import compile_scene
 from vecenv.render import lod
 
-# Largest error in metres: of the gripper, which fills a third of the wrist image, of what it handles, and of what
-# stands at least a metre away.
-TOOL, NEAR, FAR = 0.0001, 0.00035, 0.0007
+# Largest error in metres by level: of the gripper, which fills a third of the wrist image, of what it handles, and of
+# what stands at least a metre away.
+ERRORS = {"exact": (0.00001, 0.000015, 0.000015), "fast": (0.0002, 0.00035, 0.0007)}
+# Strips of a weave are not much thicker than that: share of the error for meshes of these names.
+WOVEN, WOVEN_SHARE = ("basket",), 0.7
 # Texture in pieces shows errors sooner: this many vertices a place or more, and this share of the error.
-PATCHY, PATCHY_SHARE = 1.25, 0.3
+PATCHY, PATCHY_SHARE = 1.25, {"exact": 1.0, "fast": 0.3}
 # How many metres of error a difference of 1 counts as: in texture coordinates, as a share of the mesh's diagonal (a
 # texture covers about one side of it), and in normals.
 TEXCOORD_SHARE, NORMAL_WEIGHT = 0.5, 0.001
@@ -35,27 +39,36 @@ _ABSOLUTE = 1 << 2
 
 def main() -> None:
     """Simplify what all scenes draw and write the file."""
-    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    before = after = 0
+    found: dict[str, dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
+    before = 0
     for task in _tasks_with_everything():
         start, scene = time.time(), compile_scene(task.problem(), visual=True)
         entities = tuple(scene.entities)
         for index in lod.drawn_meshes(scene.model):
             mesh, name = lod.Mesh.of(scene.model, index), scene.model.mesh(index).name
             if mesh.key not in found and len(mesh.face) > 100:
-                corners, normals = simplified(mesh, _textured(scene.model, index), _error(name, entities))
-                found[mesh.key] = corners, normals
-                before, after = before + len(mesh.face), after + len(corners)
+                textured = _textured(scene.model, index)
+                errors = {level: _error(name, entities, level) for level in ERRORS}
+                found[mesh.key] = {level: simplified(mesh, textured, level, errors[level]) for level in ERRORS}
+                before += len(mesh.face)
         print(f"{task.suite} {task.index}: {len(found)} meshes, {time.time() - start:.0f} s", file=sys.stderr)
     path = Path(lod.__file__).with_name(lod.FILE)
-    np.savez_compressed(
-        path,
-        keys=np.array(list(found)),
-        counts=np.array([len(corners) for corners, _ in found.values()]),
-        corners=np.concatenate([corners for corners, _ in found.values()]).astype(np.uint32),
-        normals=np.concatenate([normals for _, normals in found.values()]),
-    )
+    arrays: Any = {
+        name: array for level in ERRORS for name, array in _stored(level, [m[level] for m in found.values()])
+    }
+    np.savez_compressed(path, keys=np.array(list(found)), **arrays)
+    after = ", ".join(f"{arrays[f'{n}_counts'].sum() + arrays[f'{n}_kept_counts'].sum()} ({n})" for n in ERRORS)
     print(f"{before} triangles became {after}; {path.name}: {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _stored(level: str, meshes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Iterator[tuple[str, np.ndarray]]:
+    """What the file has of a level (``vecenv.render.lod.simplified``): kept triangles as steps from one to the next."""
+    kept, corners, normals = zip(*meshes, strict=True)
+    yield f"{level}_kept", np.concatenate([np.diff(rows, prepend=0) for rows in kept]).astype(np.uint32)
+    yield f"{level}_kept_counts", np.array([len(rows) for rows in kept])
+    yield f"{level}_corners", np.concatenate(corners).astype(np.uint32)
+    yield f"{level}_counts", np.array([len(rows) for rows in corners])
+    yield f"{level}_normals", np.concatenate(normals)
 
 
 def _tasks_with_everything() -> list[suites.TaskSpec]:
@@ -71,10 +84,13 @@ def _tasks_with_everything() -> list[suites.TaskSpec]:
     return chosen
 
 
-def _error(mesh: str, entities: tuple[str, ...]) -> float:
+def _error(mesh: str, entities: tuple[str, ...], level: str) -> float:
+    tool, near, far = ERRORS[level]
     if mesh.startswith("gripper0_"):
-        return TOOL
-    return NEAR if mesh.startswith((*entities, "robot0_")) and not mesh.startswith(_FAR_NAMES) else FAR
+        return tool
+    if mesh.startswith((*entities, "robot0_")) and not mesh.startswith(_FAR_NAMES):
+        return near * (WOVEN_SHARE if mesh.startswith(WOVEN) else 1)
+    return far
 
 
 def _textured(model, index: int) -> bool:
@@ -82,8 +98,10 @@ def _textured(model, index: int) -> bool:
     return bool((model.mat_texid[model.geom_matid[geoms]] >= 0).any())
 
 
-def simplified(mesh: lod.Mesh, textured: bool, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the original [n, 3] and quantised normals, int8 [n, 3, 3], of a simplified mesh."""
+def simplified(mesh: lod.Mesh, textured: bool, level: str, error: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A simplified mesh: original triangles that stay, int [k], and corners [n, 3] of new ones, which are corners of
+    the original, with quantised normals, int8 [n, 3, 3].
+    """
     pos = mesh.vert[mesh.face.ravel()]
     normal = mesh.normal[mesh.face_normal.ravel()]
     place = np.unique(pos, axis=0, return_inverse=True)[1].ravel()
@@ -92,9 +110,9 @@ def simplified(mesh: lod.Mesh, textured: bool, error: float) -> tuple[np.ndarray
         keys.append(mesh.texcoord[mesh.face_texcoord.ravel()])
     merged, first, inverse = np.unique(np.concatenate(keys, axis=1), axis=0, return_index=True, return_inverse=True)
     inverse = inverse.ravel()
-    normal_weight = FAR_NORMAL_WEIGHT if error == FAR and textured else NORMAL_WEIGHT
+    normal_weight = FAR_NORMAL_WEIGHT if error == ERRORS["fast"][-1] and textured else NORMAL_WEIGHT
     if len(merged) > PATCHY * (place.max() + 1):
-        error *= PATCHY_SHARE
+        error *= PATCHY_SHARE[level]
     triangles = place.reshape(-1, 3)
     proper = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
     sides = pos.reshape(-1, 3, 3)
@@ -106,9 +124,25 @@ def simplified(mesh: lod.Mesh, textured: bool, error: float) -> tuple[np.ndarray
     texcoord_weight = TEXCOORD_SHARE * float(np.linalg.norm(np.ptp(pos, axis=0)))
     attributes = np.concatenate([merged[:, 3:] * texcoord_weight, smooth * normal_weight], axis=1)
     kept = _meshopt(inverse.reshape(-1, 3)[proper], merged[:, :3], attributes, error)
-    corners = first[kept]
+    same = _same(inverse.reshape(-1, 3), kept)
+    corners = first[kept[same < 0]]
     flat = np.repeat(cross, 3, axis=0) / np.maximum(weight, 1e-20)
-    return corners, _normals(corners, pos, flat, normal * weight, normal, place)
+    return np.sort(same[same >= 0]), corners, _normals(corners, pos, flat, normal * weight, normal, place)
+
+
+def _same(faces: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Which of the faces [m, 3] each other one [n, 3] is, up to where it begins; -1 for none."""
+    keys, wanted = _face_keys(faces), _face_keys(others)
+    order = np.argsort(keys, kind="stable")
+    at = order[np.minimum(np.searchsorted(keys[order], wanted), len(order) - 1)]
+    return np.where(keys[at] == wanted, at, -1)
+
+
+def _face_keys(faces: np.ndarray) -> np.ndarray:
+    """A number for each face, int64 [n]: its smallest vertex and, in turn, the others."""
+    turns = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(faces.astype(np.int64), turns, axis=1).T
+    return (a << 42) | (b << 21) | c
 
 
 def _normals(

@@ -258,7 +258,7 @@ def test_derivatives_of_a_step_are_those_of_finite_differences() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"obs": "pixels"}, "nothing renders"),
+        ({"obs": "pixels", "image_size": 0}, "image_size"),
         ({"obs": ()}, "proprio"),
         ({"obs": ("proprio", "touch")}, "touch"),
         ({"action": "velocity"}, "osc, joint"),

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from voxposer_world import HOME, box, handle, snapshot, space
 
 import vecenv
-from vecenv.contract import ObjectsSnapshot
+from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from vecenv.libero.env import LiberoEnv
+from voxposer.grasps import Gripper, room_around
 from voxposer.interface import qmult
 from voxposer.perception import Grid, Hand, Perception, PerceptionError, opening_direction, quaternion
 from voxposer.world import matrix
@@ -228,6 +229,79 @@ def test_what_is_held_moves_along_with_the_hand() -> None:
     np.testing.assert_allclose(after["_position_world"] - before["_position_world"], [0.1, 0.2, 0.05], atol=1e-9)
     np.testing.assert_allclose(after.hand_offset, offset, atol=1)
     np.testing.assert_array_equal(world.detect("gripper").position, world.grid.voxel(HOME[:3] + [0.1, 0.2, 0.05]))
+
+
+# -- spaces entered from a side ----------------------------------------------------------------------------------------
+
+OVEN = np.array([0.15, 0.3, 0.13])
+
+
+def oven(**parts: Part) -> ObjectsSnapshot:
+    """A cube in the hand, and an oven of five walls that is open towards -y, with a space in it."""
+    walls = [
+        box(half, OVEN + shift, 400)
+        for half, shift in [
+            ((0.14, 0.11, 0.01), (0, 0, -0.1)),
+            ((0.14, 0.11, 0.01), (0, 0, 0.1)),
+            ((0.01, 0.11, 0.1), (-0.13, 0, 0)),
+            ((0.01, 0.11, 0.1), (0.13, 0, 0)),
+            ((0.14, 0.01, 0.1), (0, 0.1, 0)),
+        ]
+    ]
+    shell = PointCloud(*(np.concatenate([getattr(wall, f) for wall in walls]) for f in ("points", "normals")))
+    inside = Part("oven_1", "space", shell, RegionBox(OVEN, np.eye(3), np.array([0.12, 0.09, 0.09]), "oven_1"))
+    things = {"cube_1": box((0.02, 0.015, 0.02), (0.0, 0.0, 0.385)), "oven_1": shell}
+    return snapshot(things, ("oven_1",), parts={"oven_1_inside": inside, **parts}, gripper=np.array([0.0155, -0.0155]))
+
+
+def test_the_way_out_of_a_roofed_space_is_its_open_side() -> None:
+    np.testing.assert_allclose(see(oven()).detect("oven_1_inside").normal, [0, -1, 0])
+
+
+def test_where_there_is_a_door_the_way_out_is_through_it() -> None:
+    hinge = PartJoint("hinge", np.array([0.0, 0.0, 1.0]), OVEN + [0.14, 0.11, 0], 2.0, np.pi / 2)
+    ajar = Part("oven_1", "door", box((0.11, 0.01, 0.09), OVEN + [0.25, 0.11, 0], 240), joint=hinge)
+    np.testing.assert_allclose(see(oven(oven_1_door=ajar)).detect("oven_1_inside").normal, [1, 0, 0], atol=1e-9)
+
+
+def test_a_space_with_a_roof_is_entered_with_the_fingers_ahead() -> None:
+    world = see(oven(), closed=True)
+    seen = world.detect("oven_1_inside")
+    pos, hand = world.position_of(seen.place_position), matrix(seen.place_quat)
+    assert hand[:, 2] @ np.array([0.0, 1.0, 0.0]) > 0.6
+    carried = (oven().objects["cube_1"].points - HOME[:3]) @ (hand @ matrix(HOME[3:]).T).T + pos
+    assert (np.abs(carried - OVEN) < [0.12, 0.09, 0.09]).all()
+    shell = oven().objects["oven_1"].points
+    assert all(room_around(pos + [0, -back, 0], hand, shell) > 0 for back in (0.0, 0.1))
+
+
+def test_room_is_measured_around_fingers_palm_and_wrist() -> None:
+    gripper = Gripper(wrist=0.14)
+    for point, room in [((0.2, 0, 0), 0.14), ((0, 0.08, 0), 0.0145), ((0.05, 0, 0.2), -0.05), ((0, 0, -0.1), 0.0905)]:
+        there = np.array(point, float) + HOME[:3]
+        assert room_around(HOME[:3], matrix(HOME[3:]), there[None], gripper) == pytest.approx(room, abs=1e-6)
+    assert room_around(HOME[:3], matrix(HOME[3:]), np.zeros((0, 3)), gripper) == np.inf
+
+
+def test_a_hand_leans_to_grasp_what_something_hangs_over() -> None:
+    plank = box((0.1, 0.1, 0.01), (0.1, 0.11, 0.17), 2000)
+    world = see(snapshot({"cube_1": box((0.02, 0.02, 0.025), (0.1, 0, 0.025)), "plank_1": plank}, ("plank_1",)))
+    seen = world.detect("cube_1")
+    pos, hand = world.position_of(seen.grasp_position), matrix(seen.grasp_quat)
+    assert -0.97 < hand[2, 2] < -0.7
+    assert hand[1, 2] > 0.2  # fingers ahead under the plank, the wrist outside
+    assert room_around(pos, hand, plank.points, Gripper(wrist=0.14)) > 0
+    alone = see(snapshot({"cube_1": box((0.02, 0.02, 0.025), (0.1, 0, 0.025))}))
+    assert matrix(alone.detect("cube_1").grasp_quat)[2, 2] < -0.99
+
+
+@pytest.mark.parametrize(("x", "leans"), [(0.3, np.pi / 4), (-0.05, 0.0)])
+def test_the_hand_that_pushes_a_part_shut_leans_as_far_as_the_robot_leaves_room(x: float, leans: float) -> None:
+    joint = PartJoint("slide", np.array([-1.0, 0.0, 0.0]), np.array([x, 0, 0.2]), 0.16, 0.1)
+    bar = Part("cabinet_1", "handle", box((0.008, 0.04, 0.008), (x, 0, 0.2), 240), joint=joint)
+    cabinet = {"cabinet_1": box((0.1, 0.1, 0.11), (x + 0.2, 0, 0.11))}
+    hand = matrix(see(snapshot(cabinet, ("cabinet_1",), parts={"h": bar})).detect("h").push_quat)
+    assert np.arccos(-hand[2, 2]) == pytest.approx(leans, abs=1e-6)
 
 
 # -- numbers -----------------------------------------------------------------------------------------------------------

@@ -189,6 +189,16 @@ def test_what_no_camera_sees_is_left_out_and_nothing_else(stage: Stage) -> None:
         whole.close()
 
 
+def test_the_sky_is_left_out_only_where_the_floor_hides_it(stage: Stage) -> None:
+    pose = shot(stage).pose
+    down, level = (stage.view(name, pose, VisualOptions(), 0) for name in ("agentview", "side"))
+    assert stage._walls.fill(stage._data, down, 1.0)
+    assert not stage._walls.fill(stage._data, level, 1.0)
+    assert not stage._walls.fill(stage._data, down, 3.0)  # so wide a picture shows what is beside the floor
+    below = UserCamera.looking_at("below", eye=[0, 0, -2], target=[0, 0, 0], up=[1, 0, 0])
+    assert not stage._walls.fill(stage._data, stage.view(below, pose, VisualOptions(), 0), 1.0)
+
+
 def test_a_user_camera_in_a_cameras_place_sees_the_same(renderer: GlRenderer, stage: Stage) -> None:
     model = stage.model
     camera = model.camera("side")

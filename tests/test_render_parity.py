@@ -18,12 +18,13 @@ from pictures import needs_gl, psnr
 import vecenv
 from vecenv.contract import Egocentric
 from vecenv.libero.env import LiberoEnv
+from vecenv.render.options import RenderConfig
 
 pytestmark = needs_gl
 
 CAMERAS = {"agentview": "agentview_image", "wrist": "robot0_eye_in_hand_image"}
-# What the project promises; measured is equality to the bit.
-ENOUGH = 45.0
+# What the project promises. With every triangle, pictures are equal to the bit, nearly all of them.
+ENOUGH = {"exact": 45.0, "original": 60.0}
 
 
 def peer_with_images(path: Any) -> Any:
@@ -41,14 +42,15 @@ def fixtures_of(peer: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 @contextmanager
-def pair(suite: str, task: int, episode: int) -> Iterator[tuple[Any, dict[str, Any], LiberoEnv]]:
+def pair(suite: str, task: int, episode: int, level: str = "exact") -> Iterator[tuple[Any, dict[str, Any], LiberoEnv]]:
     """Upstream right after ``set_init_state``, its observation, and ours in the same start."""
     spec = vecenv.list_tasks(suite)[task]
     peer = peer_with_images(spec.bddl_path)
     with upstream.silence():
         peer.reset()  # which hides what a new environment still shows: the gripper's frames
     seen = peer.set_init_state(spec.init_states()[episode])
-    env = vecenv.make(suite, task=task, episodes=[episode], fixtures=fixtures_of(peer), start="raw", settle_steps=0)
+    options: Any = {"fixtures": fixtures_of(peer), "start": "raw", "settle_steps": 0}
+    env = vecenv.make(suite, task=task, episodes=[episode], render=RenderConfig(lod=level), **options)
     assert isinstance(env, LiberoEnv)
     env.reset()
     yield peer, seen, env
@@ -65,16 +67,17 @@ def random_action(rng: np.random.Generator) -> np.ndarray:
     return np.append(rng.uniform(-1, 1, 6), rng.choice([-1.0, 1.0]))
 
 
-def test_pictures_of_a_rollout_are_upstreams() -> None:
+@pytest.mark.parametrize("level", list(ENOUGH))
+def test_pictures_of_a_rollout_are_upstreams(level: str) -> None:
     """The start, and frames in motion: upstream samples them within the 24th of 25 substeps."""
     rng = np.random.default_rng(0)
-    with pair("libero_goal", 7, episode=2) as (peer, seen, env):
-        assert agreement(env.observe_egocentric(), seen) > ENOUGH
+    with pair("libero_goal", 7, 2, level) as (peer, seen, env):
+        assert agreement(env.observe_egocentric(), seen) > ENOUGH[level]
         for _ in range(3):
             action = random_action(rng)
             theirs, *_ = peer.step(action)
             env.step_continuous(action[None])
-            assert agreement(env.observe_egocentric(), theirs) > ENOUGH
+            assert agreement(env.observe_egocentric(), theirs) > ENOUGH[level]
 
 
 @pytest.mark.heavy
@@ -95,7 +98,7 @@ def test_pictures_of_every_scene_are_upstreams(scene_id: str) -> None:
         env.set_state(qpos=qpos[None], qvel=qvel[None])
         found.append(agreement(env.observe_egocentric(), theirs))
         print(scene_id, [round(value, 1) for value in found])
-        assert min(found) > ENOUGH
+        assert min(found) > ENOUGH["exact"]
 
 
 def _shuffled(env: LiberoEnv, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -38,9 +38,27 @@ def test_cameras_stand_side_by_side() -> None:
 
 def test_titles_stand_above_and_leave_the_images_alone() -> None:
     pytest.importorskip("PIL")
-    grid = render_grid(IMAGES[:1], ["libero_object/0/3: pick up the soup and place it in the basket"])
+    grid = render_grid(IMAGES[:1], ["soup"])
     np.testing.assert_array_equal(inner(grid, 0, 0, TITLE_HEIGHT), IMAGES[0])
     assert (grid[:TITLE_HEIGHT].max(axis=-1) > 200).any()
+
+
+def test_long_titles_take_up_to_three_lines_in_every_tile() -> None:
+    pytest.importorskip("PIL")
+    grid = render_grid(IMAGES[:2], ["soup", "pick up the soup and place it in the basket"], columns=2)
+    assert grid.shape[0] == 20 + 3 * TITLE_HEIGHT + 2 * GAP
+    for column in range(2):
+        np.testing.assert_array_equal(inner(grid, 0, column, 3 * TITLE_HEIGHT), IMAGES[column])
+
+
+def test_titles_say_the_verdict_in_its_colour() -> None:
+    pytest.importorskip("PIL")
+    images = np.zeros((3, 20, 120, 3), np.uint8)
+    grid = render_grid(images, ["soup"] * 3, columns=1, verdicts=[True, False, None]).astype(int)
+    heads = grid.reshape(3, -1, grid.shape[1], 3)[:, GAP : GAP + TITLE_HEIGHT, GAP:-GAP]
+    greener, redder = heads[..., 1] - heads[..., 0], heads[..., 0] - heads[..., 1]
+    assert [int(head.max()) > 60 for head in greener] == [True, False, False]
+    assert [int(head.max()) > 60 for head in redder] == [False, True, False]
 
 
 def test_verdicts_frame_a_slot() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -313,6 +315,31 @@ def test_the_policy_reports_what_an_episode_took() -> None:
     assert said["cause"] == "followed to the end without success"
 
 
+def test_maps_and_snapshots_are_let_go_of_without_the_cycle_collector() -> None:
+    env = Obedient(snapshot(CUBE), budget=300)
+    acting, _ = agent(env, ("lift",))
+    gc.collect()
+    gc.disable()
+    try:
+        made: list[weakref.ref[np.ndarray]] = []
+        for slot in acting.slots:
+            filled = slot.interface._filled
+            slot.interface._filled = lambda value, filled=filled: _followed(filled(value), made)  # type: ignore[method-assign]
+        acting.step()
+        assert made
+        assert sum(array() is not None for array in made) == 0
+        seen = weakref.ref(acting.slots[0].interface.perception)
+        acting.close()
+        assert seen() is None
+    finally:
+        gc.enable()
+
+
+def _followed(array: np.ndarray, made: list[weakref.ref[np.ndarray]]) -> np.ndarray:
+    made.append(weakref.ref(array))
+    return array
+
+
 # -- pushing -----------------------------------------------------------------------------------------------------------
 
 
@@ -338,6 +365,30 @@ def test_places_that_a_thing_has_passed_are_passed_over() -> None:
     assert pushing.cursor == 1
     assert arrived(Pushing("plate_1", way), plate(0.295))
     assert arrived(Pushing("plate_1", way, pushes=PushingConfig().most), plate())
+
+
+def test_a_push_in_vain_is_not_repeated() -> None:
+    pushing = Pushing("plate_1", np.array([[0.2, 0.0, 0.02]]))
+    before = sight(pushing, plate(), PushingConfig())
+    next_pushes([before], PushingConfig())
+    assert not arrived(pushing, plate(0.002))  # it hardly moved
+    (vain,) = pushing.vain
+    again = sight(pushing, plate(0.002), PushingConfig())
+    touched = plate().snapshot.objects["plate_1"].points
+    near = np.linalg.norm((touched - vain)[:, :2], axis=1) < 0.02
+    assert before.free[near].any()
+    assert not again.free[near].any()
+    next_pushes([again], PushingConfig())
+    assert not arrived(pushing, plate(0.05))
+    assert pushing.vain == []
+
+
+def test_a_thing_against_a_wall_is_pushed_aside_first() -> None:
+    wall = {"wall_1": box((0.005, 0.4, 0.15), (-0.082, 0, 0.15), 8000)}
+    seen = begin(snapshot({"plate_1": box((0.07, 0.07, 0.02), (0, 0, 0.02)), **wall}, ("wall_1",))).perception
+    found = sight(Pushing("plate_1", np.array([[0.45, 0.0, 0.02]])), seen, PushingConfig())
+    assert abs(found.goal[1]) > 0.015
+    assert found.free.any()
 
 
 def test_a_thing_with_walls_all_around_cannot_be_pushed() -> None:

@@ -169,6 +169,18 @@ def test_straight_up_is_no_detour() -> None:
     assert len(route) == 1
 
 
+def test_what_something_hangs_over_is_moved_aside_before_it_goes_up() -> None:
+    plank = box((0.1, 0.1, 0.01), (0.0, 0.11, 0.15), 2000)
+    things = {"plank_1": plank, "cube_1": box((0.02, 0.02, 0.02), (0, 0, 0.03))}
+    world = World(snapshot(things, ee_pose=np.array([0, 0, 0.05, *DOWN])), Margins())
+    ups = [stop(0.0, 0.05, closed=True), stop(0.0, 0.1, closed=True), stop(0.0, 0.2, closed=True, final=True)]
+    route = travel(ups, world, "cube_1")
+    assert route[0].pos[2] == pytest.approx(0.05)
+    assert route[0].pos[1] < -0.015  # out from under the plank, whose edge is at y = 0.01
+    np.testing.assert_allclose(route[-1].pos[:2], route[0].pos[:2])
+    assert len(travel(ups, world)) == 1  # an empty hand goes straight up
+
+
 def test_a_tilted_hand_comes_along_its_own_axis() -> None:
     tilt = np.array([0.8, 0.0, -0.6])
     quat = np.array([np.cos(1.107), 0.0, np.sin(1.107), 0.0])

@@ -565,7 +565,7 @@ def _way_out(part: Part, world: World) -> np.ndarray:
     ways = {face: part.box.mat[:, face[0]] * face[1] for face in faces}
     before = {face: _points_before(share, *face) for face in faces}
     upward = max(faces, key=lambda face: ways[face][2])
-    if before[upward] < 0.03 * len(share):
+    if before[upward] < max(3, 0.008 * len(share)):
         return ways[upward]
     towards = np.zeros(3) if world.base is None else np.append(world.base - part.box.pos[:2], 0.0)
     level = [face for face in faces if abs(ways[face][2]) < 0.5]

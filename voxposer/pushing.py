@@ -205,14 +205,14 @@ def _searched(sights: Sequence[Sight], config: PushingConfig) -> list[list[Stop]
         s.pushing.begun = clouds[i].points.mean(axis=0), np.asarray(push.contact[i], float)
         s.pushing.pushes += 1
         s.pushing.cursor = min(s.pushing.cursor + 1, len(s.pushing.way) - 1)
-    return [_way(i, push, s.perception, s.lowest, config) for i, s in enumerate(sights)]
+    return [_way(i, push, s, config) for i, s in enumerate(sights)]
 
 
-def _way(slot: int, push: Push, perception: Perception, lowest: float, config: PushingConfig) -> list[Stop]:
+def _way(slot: int, push: Push, sight: Sight, config: PushingConfig) -> list[Stop]:
     """The stops of a slot's push, from the first of the starts that has room."""
     contact, ahead = np.asarray(push.contact[slot], float), np.asarray(push.direction[slot], float)
-    ground = float(lowest)
-    fitting = [s for s in config.starts if _fits(perception, contact[None], ahead[None], ground, *s, config)[0]]
+    perception, name, ground = sight.perception, sight.pushing.name, sight.lowest
+    fitting = [s for s in config.starts if _fits(perception, name, contact[None], ahead[None], ground, s, config)[0]]
     distance, slant = (fitting or config.starts)[0]
     chosen = replace(config.push, start_distance=distance, slant=slant)
     one = Push(*(value[slot : slot + 1] for value in push))
@@ -233,7 +233,8 @@ def _touchable(
         return touchable
     ahead = ahead[rows]
     met = cloud.points[rows] - _reach_back(cloud.points, rows, ahead, lowest, config)[:, None] * ahead
-    room = np.any([_fits(perception, met, ahead, lowest, *start, config) for start in config.starts], axis=0)
+    name = pushing.name
+    room = np.any([_fits(perception, name, met, ahead, lowest, start, config) for start in config.starts], axis=0)
     for place in pushing.vain:
         room &= np.linalg.norm((met - cloud.points.mean(axis=0) - place)[:, :2], axis=1) > config.elsewhere
     touchable[rows] = room
@@ -254,30 +255,64 @@ def _reach_back(
 
 def _fits(
     perception: Perception,
+    name: str,
     contacts: np.ndarray,
     ahead: np.ndarray,
     lowest: float,
-    distance: float,
-    slant: float,
+    start: tuple[float, float],
     config: PushingConfig,
 ) -> np.ndarray:
-    """Whether the hand has room where pushes of ``contacts`` [M, 3] along ``ahead`` [M, 3] start, bool [M]."""
-    start = contacts - distance * ahead
-    start[:, 2] = np.maximum(start[:, 2], lowest)
-    obstacles = np.concatenate([perception.world.others(), perception.world.walls])
-    obstacles = obstacles[np.linalg.norm((obstacles - contacts.mean(axis=0))[:, :2], axis=1) < 0.4]
-    obstacles = _thinned(obstacles[obstacles[:, 2] > lowest - config.over_ground + 0.005])
-    up = np.array([0.0, 0.0, 1.0])
-    out = np.sin(slant) * ahead - np.cos(slant) * up
-    left = np.cross(up, ahead)
-    hands = np.stack([np.cross(left, out), left, out], axis=2)
-    local = np.einsum("nmk,nkj->nmj", obstacles[None] - start[:, None], hands)
-    hit = np.zeros(local.shape[:2], bool)
-    for low, high in config.body:
-        hit |= ((local > np.array(low) - config.room) & (local < np.array(high) + config.room)).all(axis=2)
+    """Whether pushes of a thing at ``contacts`` [M, 3] along ``ahead`` [M, 3] have room, bool [M].
+
+    The hand needs it where it starts, so far before the contact and with that slant; its fingers need it, apart from
+    the thing, on the way.
+    """
+    distance, slant = start
+    begin = _raised(contacts - distance * ahead, lowest)
+    hands = _hands(ahead, slant)
+    around = _obstacles(perception, (), contacts, lowest, config)
+    hit = _meets(around, begin, hands, config.body, config.room)
+    others = _obstacles(perception, (name,), contacts, lowest, config)
+    for share in (0.5, 0.2):
+        between = _raised(contacts - share * distance * ahead, lowest)
+        hit |= _meets(others, between, hands, config.body[:1], 0.0)
     reach = config.reach - config.slanted_reach * max(np.sin(slant), 0.0)
-    near = np.linalg.norm((start - perception.base)[:, :2], axis=1) < reach
-    return ~np.asarray(hit.any(axis=1)) & near
+    return ~hit & (np.linalg.norm((begin - perception.base)[:, :2], axis=1) < reach)
+
+
+def _raised(points: np.ndarray, lowest: float) -> np.ndarray:
+    return np.maximum(points, [-np.inf, -np.inf, lowest])
+
+
+def _hands(ahead: np.ndarray, slant: float) -> np.ndarray:
+    """Rotations of hands whose fingers point down, slanted towards ``ahead``, [M, 3, 3]."""
+    up = np.array([0.0, 0.0, 1.0])
+    out, left = np.sin(slant) * ahead - np.cos(slant) * up, np.cross(up, ahead)
+    return np.stack([np.cross(left, out), left, out], axis=2)
+
+
+def _obstacles(
+    perception: Perception, ignored: tuple[str, ...], contacts: np.ndarray, lowest: float, config: PushingConfig
+) -> np.ndarray:
+    """Surface above the table within reach of a hand at one of the contacts, [N, 3]."""
+    points = np.concatenate([perception.world.others(*ignored), perception.world.walls])
+    points = points[np.linalg.norm((points - contacts.mean(axis=0))[:, :2], axis=1) < 0.4]
+    return _thinned(points[points[:, 2] > lowest - config.over_ground + 0.005])
+
+
+def _meets(
+    points: np.ndarray,
+    at: np.ndarray,
+    hands: np.ndarray,
+    boxes: Sequence[tuple[tuple[float, ...], tuple[float, ...]]],
+    room: float,
+) -> np.ndarray:
+    """Whether points [N, 3] lie in one of a hand's boxes, or nearer to it than ``room``, for each hand, bool [M]."""
+    local = np.einsum("nmk,nkj->nmj", points[None] - at[:, None], hands)
+    hit = np.zeros(local.shape[:2], bool)
+    for low, high in boxes:
+        hit |= ((local > np.array(low) - room) & (local < np.array(high) + room)).all(axis=2)
+    return np.asarray(hit.any(axis=1))
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:

@@ -165,8 +165,8 @@ def _cost(arm: Arm, qpos: np.ndarray, base: np.ndarray, offers: _Offers, failed:
     _, facing = arm.tool(qpos, base)
     turn = np.linalg.norm(rotvec_from_rotation(offers.rotation @ facing.T), axis=1)
     tilt = np.arccos(np.clip(-offers.approach[:, 2], -1, 1))
-    cost = 0.2 * turn + tilt + offers.width / arm.hand.widest
-    cost += 8.0 * (1 - offers.square) + 2.0 * np.abs(offers.opening[:, 2])
+    cost = 0.5 * turn + tilt + offers.width / arm.hand.widest
+    cost += 6.0 * (1 - offers.square) + 2.5 * np.abs(offers.opening[:, 2])
     for grasp in failed:
         unlike = np.linalg.norm(rotvec_from_rotation(offers.rotation @ grasp.rotation.T), axis=1)
         cost += np.maximum(0.0, 1.0 - unlike / 0.5)

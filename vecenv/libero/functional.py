@@ -49,12 +49,17 @@ from vecenv.physics import mjx as mjx_physics
 from vecenv.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS
 from vecenv.physics.base import Start as PhysicsStart
 from vecenv.physics.budgets import Budget
+from vecenv.physics.mapped import Sized
 from vecenv.physics.mjx import System, World, jit
+from vecenv.render.options import LARGEST_SIDE, POLICY_CAMERAS
+from vecenv.render.raytrace import RayTracer
+from vecenv.render.scenery import Scenery, installed_scenery
 
 __all__ = ["Data", "FunctionalConfig", "FunctionalError", "LiberoEnv", "State", "default_config", "jit", "randomize"]
 
 ACTIONS = {"osc": 7, "joint": 8}
-OBSERVATIONS = ("proprio", "objects")
+OBSERVATIONS = ("proprio", "objects", "pixels")
+_PIXELS = "pixels"
 CONES = {"elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC, "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL}
 REWARDS = ("sparse", "shaped")
 PLACEMENTS = ("stored", "regions")
@@ -84,7 +89,11 @@ class FunctionalConfig:
         action: ``"osc"``, seven numbers in [-1, 1] as upstream takes them (position, rotation vector, gripper: positive
             closes); or ``"joint"``, eight: by how much each joint's target leads the joint (1 is 0.05 rad), gripper.
         action_scale: factor on the arm's part of an action, in (0, 1].
-        obs: what observations hold, one name or several: ``"proprio"``, ``"objects"``; see ``LiberoEnv.layout``.
+        obs: what observations hold, one name or several: ``"proprio"``, ``"objects"``, see ``LiberoEnv.layout``; and
+            ``"pixels"``, ray-traced camera images, which need ``warp`` and make observations dictionaries.
+        image_size: height and width of the images, pixels.
+        scenery: what there is to see, a file that ``vecenv.render.scenery.Scenery.save`` wrote; None compiles it from
+            the installed packages.
         reward: ``"sparse"``, 1 in the step that succeeds; or ``"shaped"``, that plus the change of the objective's
             potential.
         objective: ``"goal"``, ``"reach"`` or ``"lift"``; defined in ``vecenv.libero.objectives``.
@@ -105,7 +114,9 @@ class FunctionalConfig:
     cone: str = "elliptic"
     action: str = "osc"
     action_scale: float = 1.0
-    obs: str | Sequence[str] = OBSERVATIONS
+    obs: str | Sequence[str] = ("proprio", "objects")
+    image_size: int = 64
+    scenery: str | None = None
     reward: str = "sparse"
     objective: str = "goal"
     target: str | None = None
@@ -128,10 +139,10 @@ class FunctionalConfig:
             if getattr(self, name) not in allowed:
                 raise FunctionalError(f"{name}={getattr(self, name)!r}: expected one of {', '.join(allowed)}")
         for name in self.observed:
-            if name == "pixels":
-                raise FunctionalError("obs='pixels': nothing renders here yet; use 'proprio' and 'objects'")
             if name not in OBSERVATIONS:
-                raise FunctionalError(f"obs={name!r}: expected 'proprio', 'objects' or both")
+                raise FunctionalError(f"obs={name!r}: expected some of {', '.join(OBSERVATIONS)}")
+        if not 1 <= self.image_size <= LARGEST_SIDE:
+            raise FunctionalError(f"image_size={self.image_size}: expected 1 to {LARGEST_SIDE}")
         if not 0 < self.action_scale <= 1:
             raise FunctionalError(f"action_scale={self.action_scale}: expected more than 0 and at most 1")
         if self.iterations is not None and (len(self.iterations) != 2 or min(self.iterations) < 1):
@@ -151,7 +162,7 @@ class FunctionalConfig:
         """
         names = (self.obs,) if isinstance(self.obs, str) else tuple(self.obs)
         if not names or len(set(names)) != len(names):
-            raise FunctionalError(f"obs={self.obs!r}: expected 'proprio', 'objects' or both")
+            raise FunctionalError(f"obs={self.obs!r}: expected some of {', '.join(OBSERVATIONS)}, each once")
         return names
 
 
@@ -222,7 +233,9 @@ class State:
 
     Attributes:
         data: the physics.
-        obs: observation, float32 [n], see ``LiberoEnv.layout``.
+        obs: observation, float32 [n], see ``LiberoEnv.layout``; with images a dictionary: ``"state"``, that vector (if
+            anything but images is observed), ``"pixels/view_0"``, the agent's camera, and ``"pixels/view_1"``, the
+            wrist's, float32 [H, W, 3] within [0, 1], as Playground and Brax name and scale them.
         reward: float32.
         done: 1 when the objective was achieved or the physics failed, else 0, float32. Time limits are the wrappers'.
         metrics: ``success`` and ``fault`` of this step, 0 or 1, float32; a fault is a non-finite state or exhausted
@@ -231,7 +244,7 @@ class State:
     """
 
     data: Data
-    obs: jax.Array
+    obs: Any
     reward: jax.Array
     done: jax.Array
     metrics: dict[str, jax.Array]
@@ -288,80 +301,6 @@ def _filled_or_kept(array: np.ndarray) -> np.ndarray | _Filled:
     return _Filled(array.shape, array.dtype, array.flat[0].item()) if uniform else array
 
 
-class _Sized:
-    """A function of one world that knows how many worlds it is mapped over.
-
-    Args:
-        function: ``function(blank, *args)`` of one world, where ``blank`` is data with contact memory for all.
-        blank: ``blank(num_worlds)``, a maker of such data.
-    """
-
-    def __init__(self, function: Callable[..., Any], blank: Callable[[int], Callable[[], mjx.Data]]) -> None:
-        self._function, self._blank = function, blank
-
-    def __call__(self, *args: Any) -> Any:
-        """The function of one world, or under ``vmap`` of many."""
-
-        @jax.custom_batching.custom_vmap
-        def one(*args: Any) -> Any:
-            return self._function(self._blank(1)(), *args)
-
-        @one.def_vmap
-        def _(size: int, batched: Any, *args: Any) -> Any:
-            return _all_batched(self._many(size, _axes(batched))(*args))
-
-        return one(*args)
-
-    def _many(self, size: int, axes: Any) -> Callable[..., Any]:
-        """The function of ``size`` worlds on leading axes; those of further ``vmap``s are folded into them."""
-
-        @jax.custom_batching.custom_vmap
-        def many(*args: Any) -> Any:
-            def one(*args: Any) -> Any:
-                return self._function(self._blank(size)(), *args)
-
-            return jax.vmap(one, in_axes=axes, axis_size=size)(*args)
-
-        @many.def_vmap
-        def _(outer: int, batched: Any, *args: Any) -> Any:
-            folded = jax.tree.map(
-                lambda x, inner, now: _fold(x, inner is not None, now, outer, size),
-                args,
-                axes,
-                tuple(batched),
-                is_leaf=lambda x: x is None,
-            )
-            either = jax.tree.map(
-                lambda inner, now: 0 if now or inner is not None else None,
-                axes,
-                tuple(batched),
-                is_leaf=lambda x: x is None,
-            )
-            out = self._many(outer * size, either)(*folded)
-            return _all_batched(jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), out))
-
-        return many
-
-
-def _axes(batched: Any) -> Any:
-    return jax.tree.map(lambda mapped: 0 if mapped else None, tuple(batched))
-
-
-def _all_batched(out: Any) -> tuple[Any, Any]:
-    return out, jax.tree.map(lambda _: True, out)
-
-
-def _fold(x: Any, inner: bool, outer: bool, outer_size: int, inner_size: int) -> Any:
-    """An array with an axis of ``outer_size`` or ``inner_size`` or both in front, with one of their product instead."""
-    if not inner and not outer:
-        return x
-    if not outer:
-        x = jnp.broadcast_to(x, (outer_size, *x.shape))
-    if not inner:
-        x = jnp.broadcast_to(x[:, None], (outer_size, inner_size, *x.shape[1:]))
-    return x.reshape(outer_size * inner_size, *x.shape[2:])
-
-
 class _Physics:
     """Begins and advances worlds of one scene.
 
@@ -381,7 +320,7 @@ class _Physics:
         self.advance = self._sized(self._advance) if sized else functools.partial(self._alone, self._advance)
 
     def _sized(self, function: Callable[..., Data]) -> Callable[..., Data]:
-        return _Sized(function, self._blank)
+        return Sized(function, lambda num_worlds: self._blank(num_worlds)())
 
     def _alone(self, function: Callable[..., Data], *args: Any) -> Data:
         return function(self._blank(1)(), *args)
@@ -508,6 +447,7 @@ class LiberoEnv:
             lift_height=self.config.lift_height,
         )
         self._observer = _Observer(self.scene, self._objective, self.config.observed)
+        self._tracer = self._made_tracer(problem) if _PIXELS in self.config.observed else None
         self._source = problem.source
 
     # -- the two functions ---------------------------------------------------------------------------------------------
@@ -520,7 +460,7 @@ class LiberoEnv:
         zero = jnp.zeros((), jnp.float32)
         return State(
             data=data,
-            obs=self._observer(data),
+            obs=self._observed(data),
             reward=zero,
             done=zero,
             metrics={"success": zero, "fault": zero},
@@ -545,12 +485,27 @@ class LiberoEnv:
         metrics = {"success": success.astype(jnp.float32), "fault": fault.astype(jnp.float32)}
         return State(
             data=data,
-            obs=self._observer(data),
+            obs=self._observed(data),
             reward=reward,
             done=(success | fault).astype(jnp.float32),
             metrics={**state.metrics, **metrics},
             info={**state.info},
         )
+
+    def _made_tracer(self, problem: Problem) -> RayTracer:
+        size, file = self.config.image_size, self.config.scenery
+        scenery = installed_scenery(problem) if file is None else Scenery.load(file)
+        scenery.check(self.scene.model)
+        return RayTracer(scenery, height=size, width=size)
+
+    def _observed(self, data: Data) -> Any:
+        vector = self._observer(data) if self._observer.size else None
+        if self._tracer is None:
+            return vector
+        rgb = self._tracer.look(data.xpos, data.xquat, data.qpos).rgb
+        assert rgb is not None
+        views = {f"{_PIXELS}/view_{camera}": image / jnp.float32(255) for camera, image in enumerate(rgb)}
+        return views if vector is None else {"state": vector, **views}
 
     def _prepared(self, action: jax.Array) -> jax.Array:
         action = jnp.asarray(action, jnp.result_type(float))
@@ -570,9 +525,12 @@ class LiberoEnv:
         return ACTIONS[self.config.action]
 
     @property
-    def observation_size(self) -> int:
-        """Width of an observation."""
-        return self._observer.size
+    def observation_size(self) -> Any:
+        """Width of an observation; with images the shapes of its parts, as Brax wants them."""
+        if self._tracer is None:
+            return self._observer.size
+        views = {f"{_PIXELS}/view_{view}": (*[self.config.image_size] * 2, 3) for view in range(len(POLICY_CAMERAS))}
+        return {**({"state": (self._observer.size,)} if self._observer.size else {}), **views}
 
     @property
     def layout(self) -> Mapping[str, slice]:
@@ -715,7 +673,7 @@ class _Observer:
         self.layout = {
             name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths.items(), ends, strict=True)
         }
-        self.size = int(ends[-1])
+        self.size = int(ends[-1]) if widths else 0
         self._names = names
 
     def __call__(self, data: Data) -> jax.Array:

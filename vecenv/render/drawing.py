@@ -32,13 +32,15 @@ from vecenv.render.options import (
 )
 
 # Groups that upstream draws: 1 holds visual geoms, 2 nothing; 0 are collision geoms. A culled geom moves to 5.
-_DRAWN_GROUPS, _HIDDEN = (1, 2), 5
+DRAWN_GROUPS, _HIDDEN = (1, 2), 5
 # Upstream's visualisation of these is off.
-_TOOL_SITES = ("robot0_", "gripper0_")
+TOOL_SITES = ("robot0_", "gripper0_")
 ROBOT = "robot"
 _ROBOT_BODIES = ("robot0_", "gripper0_", "mount0_")
 # Room for what MuJoCo adds to the model's geoms and sites.
 _SPARE_GEOMS = 64
+# Rays a side of the grid that looks for the sky.
+_GRID = 17
 _FONT = mujoco.mjtFontScale.mjFONTSCALE_50
 
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
@@ -99,20 +101,20 @@ class Stage:
         self.model = model = scene.model
         self.cameras = _names(model, _CAMERA, model.ncam)
         self.instances = ("", ROBOT, *scene.entities)
-        self._instance_of_body = _instances(model, scene)
+        self._instance_of_body = instances_of_bodies(model, scene)
         self._data = mujoco.MjData(model)
         self._lock = threading.Lock()
         self._groups, self._shine = model.geom_group.copy(), model.mat_reflectance.copy()
         # Only meshes are left out when they are out of sight. Other shapes have few triangles, and Mesa's software
         # driver sometimes smears a wall behind the camera into the picture: upstream's have that, so must these.
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
-        self._boxes = _Boxes(model)
+        self._boxes, self._walls = _Boxes(model), _Walls(model)
         self._burners = _burners(model, scene)
         for site in range(model.nsite):
-            if model.site(site).name.startswith(_TOOL_SITES):
+            if model.site(site).name.startswith(TOOL_SITES):
                 model.site_group[site] = _HIDDEN
         self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = [group in _DRAWN_GROUPS for group in range(mujoco.mjNGROUP)]
+        self._option.geomgroup[:] = [group in DRAWN_GROUPS for group in range(mujoco.mjNGROUP)]
 
     def check_physics(self, physics: mujoco.MjModel) -> None:
         """See that poses of a physics model fit.
@@ -227,6 +229,8 @@ class Stage:
         eye = mujoco.MjvCamera()
         eye.type, eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         mujoco.mjv_updateScene(model, data, self._option, None, eye, mujoco.mjtCatBit.mjCAT_ALL, frame)
+        # The sky fills the whole picture first, which costs as much as all walls.
+        frame.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = not self._walls.fill(data, view, aspect)
         model.geom_group[:], model.mat_reflectance[:] = self._groups, self._shine
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = before
         return view
@@ -264,7 +268,7 @@ class Stage:
         model = self.model
         if name in self.instances[1:]:
             body = self._instance_of_body[model.geom_bodyid] == self.instances.index(name)
-            geoms = np.flatnonzero(body & np.isin(self._groups, _DRAWN_GROUPS))
+            geoms = np.flatnonzero(body & np.isin(self._groups, DRAWN_GROUPS))
             materials = np.unique(model.geom_matid[geoms])
             return materials[materials >= 0], geoms[model.geom_matid[geoms] < 0]
         material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, name)
@@ -304,6 +308,43 @@ class _Boxes:
         return self._endless | (distance - reach <= bounds[:, None]).all(axis=0)
 
 
+class _Walls:
+    """The opaque boxes and planes of a model that never move, for leaving out a sky that they hide."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE))
+        alpha = np.where(model.geom_matid >= 0, model.mat_rgba[model.geom_matid, 3], model.geom_rgba[:, 3])
+        still = model.body_weldid[model.geom_bodyid] == 0
+        self._geoms = np.flatnonzero(flat & still & np.isin(model.geom_group, DRAWN_GROUPS) & (alpha == 1))
+        half = model.geom_size[self._geoms].copy()
+        planes = model.geom_type[self._geoms] == mujoco.mjtGeom.mjGEOM_PLANE
+        # A plane whose size is 0 has no end; its third size is how finely MuJoCo draws its grid.
+        half[planes] = np.where(half[planes] > 0, half[planes], np.inf)
+        half[planes, 2] = 0
+        self._half, self._is_plane = half, planes
+
+    def fill(self, data: mujoco.MjData, view: View, aspect: float) -> bool:
+        """Whether all of a grid of rays over the picture, its corners included, end at a wall."""
+        rays = _picture_rays(view, aspect)
+        turn = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
+        eye = np.einsum("nji,nj->ni", turn, view.pos - data.geom_xpos[self._geoms])[:, None]
+        way = rays @ turn
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.stack([(-self._half[:, None] - eye) / way, (self._half[:, None] - eye) / way])
+        # Not numbers are rays along a face; fmin and fmax leave those out.
+        first, last = np.fmax.reduce(ends.min(axis=0), axis=-1), np.fmin.reduce(ends.max(axis=0), axis=-1)
+        # GL draws the fronts only: not a box from inside, nor a plane from below.
+        front = ~self._is_plane[:, None] | (eye[..., 2] > 0)
+        return bool(((first <= last) & (first > 0) & front).any(axis=0).all())
+
+
+def _picture_rays(view: View, aspect: float) -> np.ndarray:
+    """Directions from the camera to a grid of points over its picture, world frame, [rays, 3]."""
+    up = np.tan(np.deg2rad(view.fovy) / 2) * np.linspace(-1, 1, _GRID)
+    x, y = np.meshgrid(up * aspect, up)
+    return np.stack([x.ravel(), y.ravel(), -np.ones(x.size)], axis=1) @ view.mat.T
+
+
 def _side_normals(view: View, aspect: float) -> np.ndarray:
     """Outward unit normals of near plane, left, right, bottom and top of what a camera sees, world frame, [5, 3]."""
     up = np.tan(np.deg2rad(view.fovy) / 2)
@@ -312,7 +353,7 @@ def _side_normals(view: View, aspect: float) -> np.ndarray:
     return (own / np.linalg.norm(own, axis=1, keepdims=True)) @ view.mat.T
 
 
-def _instances(model: mujoco.MjModel, scene: Scene) -> np.ndarray:
+def instances_of_bodies(model: mujoco.MjModel, scene: Scene) -> np.ndarray:
     """Index of the instance that each body belongs to, 0 for none, int [nbody]."""
     roots = {entity.root_body: number for number, entity in enumerate(scene.entities.values(), start=2)}
     found = np.zeros(model.nbody, int)
@@ -330,11 +371,12 @@ def _burners(model: mujoco.MjModel, scene: Scene) -> list[tuple[int, list[int], 
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, f"{entity.name}_burner")
         turn_on = catalog.articulation(entity.category).turn_on
         if site >= 0 and turn_on is not None:
-            found.append((site, _hinges(model, entity), _passes(turn_on)))
+            found.append((site, hinges(model, entity), _passes(turn_on)))
     return found
 
 
-def _hinges(model: mujoco.MjModel, entity: Entity) -> list[int]:
+def hinges(model: mujoco.MjModel, entity: Entity) -> list[int]:
+    """Addresses in qpos of the hinges of an entity."""
     joints = [model.joint(name) for name in entity.joints]
     return [int(joint.qposadr[0]) for joint in joints if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE]
 

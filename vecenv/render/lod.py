@@ -1,10 +1,11 @@
-"""Fewer triangles: ``lod="fast"`` draws simplified meshes, which look almost the same and cost a fraction.
+"""Fewer triangles: the levels of detail draw simplified meshes, which look the same or almost and cost less.
 
 In: the compiled visual model of a scene. Out: the same model, its visual meshes replaced in place by simplified ones;
-geoms, materials, textures and everything else stay. The simplified meshes come with the package
-(``simplified.npz``, made by ``scripts/simplify_meshes.py``) and are found by the content of the mesh they replace, so a
-mesh that is not known there is drawn as it is. Every triangle corner of a simplified mesh is a corner of the original,
-position and texture coordinate alike; only the normals are new, averages of what was around.
+geoms, materials, textures and everything else stay. ``"exact"`` leaves out what is far below a pixel, ``"fast"`` more,
+``"original"`` nothing. The simplified meshes come with the package (``simplified.npz``, made by
+``scripts/simplify_meshes.py``) and are found by the content of the mesh they replace, so a mesh that is not known there
+is drawn as it is. Every triangle corner of a simplified mesh is a corner of the original, position and texture
+coordinate alike; triangles that are new have new normals, averages of what was around.
 """
 
 from __future__ import annotations
@@ -19,6 +20,11 @@ import mujoco
 import numpy as np
 
 FILE = "simplified.npz"
+# Levels that the file has.
+STORED = ("exact", "fast")
+# Meshes of fewer triangles are drawn whole: there is little to gain and, close to the wrist camera, a knob's shade to
+# lose (38 dB).
+LEAST = {"exact": 6000, "fast": 0}
 # Normals are stored as whole numbers up to this.
 NORMAL_SCALE = 127
 
@@ -75,46 +81,76 @@ def drawn_meshes(model: mujoco.MjModel) -> Iterator[int]:
     yield from np.unique(model.geom_dataid[drawn]).tolist()
 
 
-def simplify(model: mujoco.MjModel) -> int:
+@dataclass(frozen=True)
+class Simplified:
+    """A simplified mesh, in terms of its original.
+
+    Attributes:
+        kept: triangles that stay as they are, int [k].
+        corners: new triangles, as corners (3 * triangle + corner) of the original, int [n, 3].
+        normals: of the new triangles' corners, float32 [n, 3, 3].
+    """
+
+    kept: np.ndarray
+    corners: np.ndarray
+    normals: np.ndarray
+
+
+def simplify(model: mujoco.MjModel, level: str = "fast") -> int:
     """Replace the drawn meshes of a model by the simplified ones that are known; returns how many triangles are left.
 
     Geoms that collide share no mesh with geoms that are drawn, and if one did, it would collide as before: MuJoCo
     collides with convex hulls, which are left alone.
+
+    Args:
+        model: a visual model as compiled.
+        level: ``"original"``, ``"exact"`` or ``"fast"``.
     """
-    known, left = simplified(), 0
+    known, left = simplified(level) if level in STORED else {}, 0
     for index in drawn_meshes(model):
         mesh = Mesh.of(model, index)
-        if mesh.key in known:
-            _replace(model, mesh, *known[mesh.key])
+        if known and len(mesh.face) >= LEAST[level] and mesh.key in known:
+            _replace(model, mesh, known[mesh.key])
         left += int(model.mesh_facenum[index])
     return left
 
 
 @functools.cache
-def simplified() -> Mapping[str, tuple[np.ndarray, np.ndarray]]:
-    """By key: triangles [n, 3], as corners (3 * face + corner) of the original, and normals, float32 [n, 3, 3]."""
+def simplified(level: str) -> Mapping[str, Simplified]:
+    """The simplified meshes of a level, by the key of their original."""
     with np.load(Path(__file__).with_name(FILE), allow_pickle=False) as stored:
-        keys, counts = stored["keys"].tolist(), stored["counts"]
-        corners, normals = stored["corners"].reshape(-1, 3), stored["normals"].reshape(-1, 3, 3)
-    ends = np.cumsum(counts)
-    parts = [slice(end - count, end) for end, count in zip(ends.tolist(), counts.tolist(), strict=True)]
-    return {
-        key: (corners[part], normals[part].astype(np.float32) / NORMAL_SCALE)
-        for key, part in zip(keys, parts, strict=True)
-    }
+        keys = stored["keys"].tolist()
+        steps, kept_counts = stored[f"{level}_kept"].astype(np.int64), stored[f"{level}_kept_counts"]
+        corners, counts = stored[f"{level}_corners"].astype(np.int64).reshape(-1, 3), stored[f"{level}_counts"]
+        normals = stored[f"{level}_normals"].reshape(-1, 3, 3).astype(np.float32) / NORMAL_SCALE
+    cuts, kept_cuts = np.cumsum(counts)[:-1], np.cumsum(kept_counts)[:-1]
+    parts = zip(np.split(steps, kept_cuts), np.split(corners, cuts), np.split(normals, cuts), strict=True)
+    return {key: Simplified(np.cumsum(a), b, c) for key, (a, b, c) in zip(keys, parts, strict=True)}
 
 
-def _replace(model: mujoco.MjModel, mesh: Mesh, corners: np.ndarray, normals: np.ndarray) -> None:
-    count = len(corners)
-    face, texcoord = mesh.face.ravel()[corners], mesh.face_texcoord.ravel()
-    distinct, rows = np.unique(normals.reshape(-1, 3), axis=0, return_inverse=True)
-    if len(distinct) <= len(mesh.normal):
-        length = np.linalg.norm(distinct, axis=1, keepdims=True)
-        mesh.normal[: len(distinct)] = distinct / np.maximum(length, 1 / NORMAL_SCALE)
-        mesh.face_normal[:count] = rows.reshape(-1, 3)
-    else:  # a smooth mesh, whose few normals do as they are
-        mesh.face_normal[:count] = mesh.face_normal.ravel()[corners]
-    mesh.face[:count] = face
-    if len(texcoord):
-        mesh.face_texcoord[:count] = texcoord[corners]
+def _replace(model: mujoco.MjModel, mesh: Mesh, new: Simplified) -> None:
+    count, corners = len(new.kept) + len(new.corners), new.corners
+    rows = _normal_rows(mesh, new)
+    for array, more in (
+        (mesh.face, mesh.face.ravel()[corners]),
+        (mesh.face_texcoord, mesh.face_texcoord.ravel()[corners] if len(mesh.face_texcoord) else None),
+        (mesh.face_normal, rows),
+    ):
+        if more is not None:
+            array[:count] = np.concatenate([array[new.kept], more])
     model.mesh_facenum[mesh.index] = count
+
+
+def _normal_rows(mesh: Mesh, new: Simplified) -> np.ndarray:
+    """Rows of the mesh's normals for the new triangles, int [n, 3]; rows that nothing uses any more are overwritten.
+
+    Where there are not enough of those, the corners keep the normals they had: a smooth mesh, whose few normals do.
+    """
+    distinct, which = np.unique(new.normals.reshape(-1, 3), axis=0, return_inverse=True)
+    unused = np.setdiff1d(np.arange(len(mesh.normal)), mesh.face_normal[new.kept])
+    if len(unused) < len(distinct):
+        return mesh.face_normal.ravel()[new.corners]
+    rows = unused[: len(distinct)]
+    length = np.linalg.norm(distinct, axis=1, keepdims=True)
+    mesh.normal[rows] = distinct / np.maximum(length, 1 / NORMAL_SCALE)
+    return rows[which.reshape(-1, 3)]

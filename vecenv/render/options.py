@@ -17,7 +17,8 @@ import numpy as np
 ALIASES: Mapping[str, str] = MappingProxyType({"wrist": "robot0_eye_in_hand"})
 # The two that VLA policies are trained on, in their order.
 POLICY_CAMERAS = ("agentview", "wrist")
-LODS = ("exact", "fast")
+LODS = ("original", "exact", "fast")
+ENGINES = ("gl", "raytrace")
 # MuJoCo's framebuffer and most drivers end here.
 LARGEST_SIDE = 4096
 
@@ -167,9 +168,12 @@ class RenderConfig:
 
     Attributes:
         height, width: of every image, pixels.
-        lod: ``"exact"``, upstream's picture; or ``"fast"``, simplified meshes (``vecenv.render.lod``).
+        lod: ``"exact"``, upstream's picture to within what can be seen; ``"original"``, with every triangle that
+            upstream draws; or ``"fast"``, simplified meshes (``vecenv.render.lod``).
         cameras: cameras besides those of the scene.
         gl: ``"egl"``, ``"osmesa"``, or None for what ``MUJOCO_GL`` says, else the first of them that works.
+        engine: ``"gl"``, upstream's renderer; or ``"raytrace"``, MuJoCo Warp's, which needs no GL and is fast on NVIDIA
+            GPUs; its pictures differ a little, and it knows neither cameras of one's own nor visual options.
         num_threads: rendering threads, each with a GL context; None for one a core.
     """
 
@@ -178,6 +182,7 @@ class RenderConfig:
     lod: str = "exact"
     cameras: Sequence[UserCamera] = ()
     gl: str | None = None
+    engine: str = "gl"
     num_threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -185,6 +190,10 @@ class RenderConfig:
             raise RenderError(f"images of {self.height} x {self.width} pixels: each side must be 1 to {LARGEST_SIDE}")
         if self.lod not in LODS:
             raise RenderError(f"lod={self.lod!r}: expected one of {', '.join(LODS)}")
+        if self.engine not in ENGINES:
+            raise RenderError(f"engine={self.engine!r}: expected one of {', '.join(ENGINES)}")
+        if self.engine == "raytrace" and self.cameras:
+            raise RenderError("engine='raytrace' knows no cameras of one's own; use engine='gl'")
         if self.num_threads is not None and self.num_threads < 1:
             raise RenderError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
         names = [camera.name for camera in self.cameras]

@@ -6,6 +6,7 @@ In: images [B, H, W, 3] and a title a slot. Out: one image, or a file that any p
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from collections.abc import Iterator, Sequence
@@ -19,12 +20,14 @@ import numpy as np
 from vecenv.contract import Rendered
 from vecenv.render.options import RenderError
 
-# Height of the line above an image that has a title, pixels; and the darkness between tiles.
+# Height of a line above an image that has a title, pixels; and the darkness between tiles.
 TITLE_HEIGHT, GAP = 16, 2
+# Lines of a title at most, and the room beside and above its text, pixels.
+_MOST_LINES, _TEXT_AT, _TEXT_SIZE = 3, (3, 2), 11
 # Control ticks a second: a video at this rate runs as fast as the robot.
 CONTROL_HZ = 20
 _BACKGROUND, _INK = (24, 24, 24), (235, 235, 235)
-_SOLVED, _FAILED = (80, 200, 120), (230, 90, 80)
+_VERDICTS = {True: ("solved", (80, 200, 120)), False: ("failed", (230, 90, 80)), None: ("", _BACKGROUND)}
 
 
 def render_grid(
@@ -38,9 +41,9 @@ def render_grid(
 
     Args:
         images: [B, H, W, 3], or several of that (two cameras, say), which are put next to each other.
-        titles: a line above each; cut off where it is too long.
+        titles: text above each, on up to three lines, as many as the longest needs; cut off where it is too long.
         columns: how many stand in a row; by default about as many as there are rows.
-        verdicts: True frames a slot in green, False in red, None not at all.
+        verdicts: True frames a slot in green, False in red, None not at all; before a title, they are words as well.
 
     Raises:
         RenderError: not images, or not as many titles or verdicts as images.
@@ -51,8 +54,9 @@ def render_grid(
             raise RenderError(f"{len(given)} {name} for {len(tiles)} images")
     if columns is not None and columns < 1:
         raise RenderError(f"columns={columns}: need at least 1")
+    heads = _heads(titles, verdicts, tiles.shape[2])
     framed = [
-        _framed(tile, titles[i] if titles else None, verdicts[i] if verdicts else None) for i, tile in enumerate(tiles)
+        _framed(tile, heads[i] if heads else None, verdicts[i] if verdicts else None) for i, tile in enumerate(tiles)
     ]
     columns = min(columns or math.ceil(math.sqrt(len(framed))), len(framed))
     height, width = framed[0].shape[:2]
@@ -75,24 +79,51 @@ def _side_by_side(images: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(sets, axis=2)
 
 
-def _framed(tile: np.ndarray, title: str | None, verdict: bool | None) -> np.ndarray:
-    head = 0 if title is None else TITLE_HEIGHT
-    color = _BACKGROUND if verdict is None else _SOLVED if verdict else _FAILED
-    height, width = tile.shape[0] + head + 2 * GAP, tile.shape[1] + 2 * GAP
-    framed = np.full((height, width, 3), color, np.uint8)
-    framed[GAP + head : -GAP, GAP:-GAP] = tile
-    if title is not None:
-        framed[GAP : GAP + head, GAP:-GAP] = _title(title, tile.shape[1])
+def _framed(tile: np.ndarray, head: np.ndarray | None, verdict: bool | None) -> np.ndarray:
+    whole = tile if head is None else np.concatenate([head, tile])
+    framed = np.full((whole.shape[0] + 2 * GAP, whole.shape[1] + 2 * GAP, 3), _VERDICTS[verdict][1], np.uint8)
+    framed[GAP:-GAP, GAP:-GAP] = whole
     return framed
 
 
-def _title(text: str, width: int) -> np.ndarray:
-    """One line of text, uint8 [TITLE_HEIGHT, width, 3]."""
-    from PIL import Image, ImageDraw, ImageFont
+def _heads(titles: Sequence[str], verdicts: Sequence[bool | None], width: int) -> list[np.ndarray]:
+    """The titles as images of one height, uint8 [lines * TITLE_HEIGHT, width, 3] each; none without titles."""
+    given = (verdicts or [None] * len(titles)) if titles else ()
+    # Where there may be verdicts, there is room for them before there are any: frames of a video have one size.
+    words = ("solved ", "failed ") if verdicts else ("",)
+    lines = max((len(_wrapped(word + title, width)) for title in titles for word in words), default=0)
+    return [_head(title, lines, width, verdict) for title, verdict in zip(titles, given, strict=True)]
 
-    line = Image.new("RGB", (width, TITLE_HEIGHT), _BACKGROUND)
-    ImageDraw.Draw(line).text((3, 2), text, fill=_INK, font=ImageFont.load_default(size=11))
-    return np.asarray(line)
+
+def _head(title: str, lines: int, width: int, verdict: bool | None) -> np.ndarray:
+    from PIL import Image, ImageDraw
+
+    word, color = _VERDICTS[verdict]
+    image = Image.new("RGB", (width, lines * TITLE_HEIGHT), _BACKGROUND)
+    draw = ImageDraw.Draw(image)
+    for number, line in enumerate(_wrapped(f"{word} {title}", width)):
+        draw.text((_TEXT_AT[0], _TEXT_AT[1] + number * TITLE_HEIGHT), line, fill=_INK, font=_font())
+    draw.text(_TEXT_AT, word, fill=color, font=_font())
+    return np.asarray(image)
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Text in lines that fit, up to the most; at least one."""
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if lines[-1] and _font().getlength(longer) > width - 2 * _TEXT_AT[0]:
+            lines.append(word)
+        else:
+            lines[-1] = longer
+    return lines[:_MOST_LINES]
+
+
+@functools.cache
+def _font() -> Any:
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size=_TEXT_SIZE)
 
 
 class VideoWriter:

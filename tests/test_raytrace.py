@@ -1,0 +1,241 @@
+"""Ray-traced images: what they show is what GL shows, for any batch, and through the functional environment."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from pictures import needs_gl, psnr
+
+import vecenv
+from vecenv.contract import Egocentric
+from vecenv.libero.functional import FunctionalConfig, LiberoEnv
+from vecenv.libero.sources import installed_tasks
+from vecenv.physics import mjx
+from vecenv.physics.budgets import Budget
+from vecenv.render.options import POLICY_CAMERAS, RenderConfig, RenderError, UserCamera
+from vecenv.render.raytrace import RayTracer, poses
+from vecenv.render.scenery import Scenery, installed_scenery
+
+pytest.importorskip("warp")
+
+# What the project promises of each image, and of the masks of each instance.
+LEAST_PSNR, LEAST_IOU = 24.0, 0.97
+# At the edge of a thing of fewer pixels, one pixel is much.
+LEAST_PIXELS = 500
+ABOVE: dict[str, Any] = {"name": "above", "pos": (0, 0, 2), "quat": (1, 0, 0, 0)}
+# LLVM's optimisation off: programs compile several times faster.
+OPTIONS: dict[str, Any] = {**mjx.compiler_options(), "xla_backend_optimization_level": 0}
+
+
+@cache
+def scenery(suite: str = "libero_spatial", task: int = 0) -> Scenery:
+    return installed_scenery(vecenv.list_tasks(suite)[task].problem())
+
+
+@cache
+def start(suite: str = "libero_spatial", task: int = 0, count: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Body positions, orientations and joints of the first episodes of a task."""
+    env = vecenv.make(suite, task=task, episodes=range(count))
+    env.reset()
+    found = posed(env)
+    env.close()
+    return found
+
+
+def posed(env: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    (group,) = env.physics.groups
+    qpos = group.seen_qpos.astype(np.float32)
+    return (*poses(group.scene.model, group.seen_qpos, group.expand("body_pos"), group.expand("body_quat")), qpos)
+
+
+def tracer(**options: Any) -> RayTracer:
+    return RayTracer(scenery(), **{"height": 24, "width": 32, "depth": True, "segmentation": True, **options})
+
+
+def look(rays: RayTracer, states: tuple[Any, ...]) -> Any:
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(rays.look))(*states))
+
+
+# -- the scenery -------------------------------------------------------------------------------------------------------
+
+
+def test_a_scenery_has_the_bodies_of_the_physics_and_nothing_that_is_not_seen() -> None:
+    physics = installed_tasks("libero_spatial")[0].scene(()).model
+    model = scenery().model
+    scenery().check(physics)
+    assert (model.nq, model.nbody) == (0, physics.nbody)
+    assert (model.body_parentid == 0).all()
+    assert set(model.geom_group) == {1}
+    assert set(model.geom_dataid[model.geom_dataid >= 0]) == set(range(model.nmesh))
+
+
+def test_a_scenery_of_another_scene_is_refused() -> None:
+    physics = installed_tasks("libero_object")[0].scene(()).model
+    with pytest.raises(RenderError, match="not of the same scene"):
+        scenery().check(physics)
+
+
+def test_a_scenery_is_read_as_it_was_written(tmp_path: Path) -> None:
+    scenery().save(tmp_path / "scenery.npz")
+    read = Scenery.load(tmp_path / "scenery.npz")
+    assert (read.instances, read.burners) == (scenery().instances, scenery().burners)
+    np.testing.assert_array_equal(read.instance_of_geom, scenery().instance_of_geom)
+    for field in ("mesh_vert", "mesh_face", "tex_data", "geom_pos", "mat_rgba"):
+        np.testing.assert_array_equal(getattr(read.model, field), getattr(scenery().model, field))
+
+
+def test_a_file_that_is_no_scenery_is_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", something=np.zeros(3))
+    with pytest.raises(RenderError, match=r"other\.npz"):
+        Scenery.load(tmp_path / "other.npz")
+
+
+# -- looking -----------------------------------------------------------------------------------------------------------
+
+
+def test_each_world_sees_its_own_state_however_it_is_mapped() -> None:
+    states, rays = start(), tracer()
+    together = look(rays, states)
+    assert together.rgb.shape == (3, len(POLICY_CAMERAS), 24, 32, 3)
+    assert (together.rgb.dtype, together.depth.dtype, together.segmentation.dtype) == ("uint8", "float32", "int16")
+    alone = jax.jit(rays.look)(*(array[1] for array in states))
+    nested = jax.jit(jax.vmap(jax.vmap(rays.look)))(*(array[None, 1:] for array in states))
+    for one, two, all_of_them in zip(alone, nested, together, strict=True):
+        np.testing.assert_array_equal(one, all_of_them[1])
+        np.testing.assert_array_equal(two[0], all_of_them[1:])
+    assert (together.rgb[0] != together.rgb[1]).any()
+
+
+def test_the_order_of_rays_changes_no_pixel() -> None:
+    states = tuple(array[:1] for array in start())
+    tiled, row_by_row = look(tracer(), states), look(tracer(tile=(1, 1)), states)
+    for one, other in zip(tiled, row_by_row, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_images_follow_a_loop_inside_one_program() -> None:
+    xpos, xquat, qpos = (jnp.asarray(array[:1]) for array in start())
+    rays = tracer(depth=False, segmentation=False)
+
+    def tick(moved: jax.Array, _: None) -> tuple[jax.Array, Any]:
+        return moved + 0.02, jax.vmap(rays.look)(moved, xquat, qpos).rgb
+
+    in_loop = jax.jit(lambda start: jax.lax.scan(tick, start, None, 3)[1])(xpos)
+    for step, images in enumerate(in_loop):
+        np.testing.assert_array_equal(images, look(rays, (xpos + 0.02 * step, xquat, qpos)).rgb)
+
+
+def test_a_burner_is_seen_while_its_stove_is_on() -> None:
+    (burner,) = scenery().burners
+    states = tuple(np.repeat(array[:1], 2, axis=0) for array in start())
+    states[2][:, list(burner.knobs)] = [[0.0], [burner.sign * (burner.bound + 1.0)]]
+    off, on = look(tracer(height=64, width=64, segmentation=False), states).rgb[:, 1].astype(int)
+    redder = (on[..., 0] - on[..., 1]) - (off[..., 0] - off[..., 1])
+    assert (redder > 50).sum() > 3
+
+
+def test_a_camera_that_is_not_there_is_named() -> None:
+    with pytest.raises(RenderError, match=r"no camera 'sky'; this scene has .*agentview"):
+        tracer(cameras=("sky",))
+
+
+def test_no_gl_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a GL context was made")
+
+    monkeypatch.setattr(mujoco, "MjrContext", refuse)
+    assert look(tracer(), tuple(array[:1] for array in start())).rgb.any()
+
+
+# -- the functional environment ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.heavy
+def test_functional_observations_have_the_views_that_playground_expects() -> None:
+    config = FunctionalConfig(
+        impl="warp",
+        budget=Budget(contacts=500, rows=1500, pairs=1, candidates=500),
+        obs=("proprio", "pixels"),
+        image_size=32,
+    )
+    env = LiberoEnv("libero_spatial", task=0, config=config)
+    assert env.observation_size == {"state": (25,), "pixels/view_0": (32, 32, 3), "pixels/view_1": (32, 32, 3)}
+    keys = jax.random.split(jax.random.key(0), 2)
+    state = jax.jit(jax.vmap(env.reset), compiler_options=OPTIONS)(keys)
+    assert {name: array.shape[1:] for name, array in state.obs.items()} == env.observation_size
+    rays = RayTracer(scenery(), height=32, width=32)
+    rgb = look(rays, (state.data.xpos, state.data.xquat, state.data.qpos)).rgb
+    for view in (0, 1):
+        np.testing.assert_allclose(state.obs[f"pixels/view_{view}"], rgb[:, view] / 255, atol=1e-6)
+
+
+# -- the batched environment -------------------------------------------------------------------------------------------
+
+
+def test_an_environment_that_is_told_to_traces_rays() -> None:
+    render = RenderConfig(height=24, width=32, lod="fast", engine="raytrace")
+    env = vecenv.make("libero_spatial", task=0, episodes=[0, 1], render=render)
+    env.reset()
+    seen, states = env.observe_egocentric(), posed(env)
+    assert isinstance(seen, Egocentric)
+    rays = look(tracer(), states)
+    for view, camera in enumerate(POLICY_CAMERAS):
+        np.testing.assert_array_equal(seen.images[camera], rays.rgb[:, view])
+        np.testing.assert_array_equal(seen.segmentations[camera], rays.segmentation[:, view])
+        np.testing.assert_array_equal(seen.depths[camera], rays.depth[:, view])
+    env.close()
+
+
+@pytest.mark.parametrize("options", [{"engine": "radiosity"}, {"engine": "raytrace", "cameras": [UserCamera(**ABOVE)]}])
+def test_what_the_engine_cannot_do_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(RenderError, match="engine"):
+        RenderConfig(**options)
+
+
+# -- against GL --------------------------------------------------------------------------------------------------------
+
+
+def compare(suite: str, task: int, size: int, episodes: list[int]) -> None:
+    env = vecenv.make(suite, task=task, episodes=episodes, render=RenderConfig(height=size, width=size, lod="original"))
+    env.reset()
+    for tick in np.random.default_rng(task).uniform(-1, 1, (8, len(episodes), 7)):
+        env.step_continuous(tick)
+    seen, states = env.observe_egocentric(), posed(env)
+    assert isinstance(seen, Egocentric)
+    found = scenery(suite, task)
+    assert found.instances == seen.instances[0]
+    rays = look(RayTracer(found, height=size, width=size, depth=True, segmentation=True), states)
+    masks: list[tuple[np.ndarray, np.ndarray]] = []
+    for view, camera in enumerate(POLICY_CAMERAS):
+        for slot in range(len(episodes)):
+            assert psnr(rays.rgb[slot, view], seen.images[camera][slot]) > LEAST_PSNR, (camera, slot)
+        masks.append((rays.segmentation[:, view], seen.segmentations[camera]))
+        error = np.abs(rays.depth[:, view] - seen.depths[camera])
+        assert np.median(error) < 1e-3
+        assert (error < 0.01).mean() > 0.99
+    check_masks(*(np.stack(each) for each in zip(*masks, strict=True)))
+    env.close()
+
+
+def check_masks(ours: np.ndarray, theirs: np.ndarray) -> None:
+    """Each instance's mask, over all images together."""
+    counts = np.bincount(theirs.ravel())
+    for instance in np.flatnonzero(counts >= LEAST_PIXELS):
+        a, b = ours == instance, theirs == instance
+        assert (a & b).sum() / (a | b).sum() > LEAST_IOU, instance
+
+
+@needs_gl
+@pytest.mark.heavy
+@pytest.mark.parametrize(
+    ("suite", "task"), [("libero_object", 0), ("libero_spatial", 0), ("libero_goal", 0), ("libero_10", 0)]
+)
+def test_pictures_are_those_of_gl(suite: str, task: int) -> None:
+    compare(suite, task, 256, [0, 7])

@@ -1,0 +1,87 @@
+"""Functions of one world that know how many worlds they are mapped over.
+
+In: a function of one world, and what it needs for a batch of a given size: MuJoCo Warp's contact memory, a render
+context. Out: a function of one world for any nesting of ``vmap``, which prepares for the whole batch once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+class Sized:
+    """A function of one world that knows how many worlds it is mapped over.
+
+    Args:
+        function: ``function(prepared, *args)`` of one world, mapped over its arguments but not over ``prepared``.
+        prepare: ``prepare(num_worlds)`` makes, inside a trace, what that many worlds share.
+    """
+
+    def __init__(self, function: Callable[..., Any], prepare: Callable[[int], Any]) -> None:
+        self._function, self._prepare = function, prepare
+
+    def __call__(self, *args: Any) -> Any:
+        """The function of one world, or under ``vmap`` of many."""
+
+        @jax.custom_batching.custom_vmap
+        def one(*args: Any) -> Any:
+            return self._function(self._prepare(1), *args)
+
+        @one.def_vmap
+        def _(size: int, batched: Any, *args: Any) -> Any:
+            return _all_batched(self._many(size, _axes(batched))(*args))
+
+        return one(*args)
+
+    def _many(self, size: int, axes: Any) -> Callable[..., Any]:
+        """The function of ``size`` worlds on leading axes; those of further ``vmap``s are folded into them."""
+
+        @jax.custom_batching.custom_vmap
+        def many(*args: Any) -> Any:
+            def one(*args: Any) -> Any:
+                return self._function(self._prepare(size), *args)
+
+            return jax.vmap(one, in_axes=axes, axis_size=size)(*args)
+
+        @many.def_vmap
+        def _(outer: int, batched: Any, *args: Any) -> Any:
+            folded = jax.tree.map(
+                lambda x, inner, now: _fold(x, inner is not None, now, outer, size),
+                args,
+                axes,
+                tuple(batched),
+                is_leaf=lambda x: x is None,
+            )
+            either = jax.tree.map(
+                lambda inner, now: 0 if now or inner is not None else None,
+                axes,
+                tuple(batched),
+                is_leaf=lambda x: x is None,
+            )
+            out = self._many(outer * size, either)(*folded)
+            return _all_batched(jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), out))
+
+        return many
+
+
+def _axes(batched: Any) -> Any:
+    return jax.tree.map(lambda mapped: 0 if mapped else None, tuple(batched))
+
+
+def _all_batched(out: Any) -> tuple[Any, Any]:
+    return out, jax.tree.map(lambda _: True, out)
+
+
+def _fold(x: Any, inner: bool, outer: bool, outer_size: int, inner_size: int) -> Any:
+    """An array with an axis of ``outer_size`` or ``inner_size`` or both in front, with one of their product instead."""
+    if not inner and not outer:
+        return x
+    if not outer:
+        x = jnp.broadcast_to(x, (outer_size, *x.shape))
+    if not inner:
+        x = jnp.broadcast_to(x[:, None], (outer_size, inner_size, *x.shape[1:]))
+    return x.reshape(outer_size * inner_size, *x.shape[2:])

@@ -1,0 +1,311 @@
+"""Pictures of worlds by ray tracing inside ``jax.jit``: MuJoCo Warp's renderer, on NVIDIA GPUs, without GL.
+
+In: a scenery (``vecenv.render.scenery``) and, for each world, the poses of its bodies as MJX keeps them. Out: images of
+one or several cameras, as delivered everywhere in vecenv: rows from the top, mirrored. ``RayTracer.look`` is a function
+of one world for ``vmap``, ``jit`` and ``scan``; all worlds it is mapped over share one render context, which is made
+when such a batch is first traced. On a CPU the same code runs, slowly.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx.warp import render_context
+
+from vecenv.controllers.rotations import quat_to_mat
+from vecenv.libero.bddl import Problem
+from vecenv.physics.mapped import Sized
+from vecenv.render.drawing import Pose
+from vecenv.render.gl import Frames, Shot, Wanted
+from vecenv.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, VisualOptions
+from vecenv.render.scenery import Scenery, installed_scenery
+
+# Threads of a block on the GPU, and the tile of pixels, rows and columns, that 32 of them trace: rays that travel
+# together are faster. Measured on an H200, benchmarks/render_gpu.py.
+BLOCK, TILE = 32, (4, 8)
+
+
+class Seen(NamedTuple):
+    """Images of C cameras of one world; what was not asked for is None.
+
+    Attributes:
+        rgb: uint8 [C, H, W, 3].
+        depth: metres from the camera's plane, 0 where nothing is, float32 [C, H, W].
+        segmentation: index into the scenery's ``instances``, int16 [C, H, W].
+    """
+
+    rgb: jax.Array | None
+    depth: jax.Array | None
+    segmentation: jax.Array | None
+
+
+class RayTracer:
+    """The cameras of a scenery.
+
+    Args:
+        scenery: what there is to see.
+        height, width: of the images, pixels.
+        cameras: which cameras, in the order of the images; ``"wrist"`` is another name of ``"robot0_eye_in_hand"``.
+        rgb, depth, segmentation: which images ``look`` makes.
+        samples: rays a pixel along each side, averaged; GL takes four a pixel. Two cost four times as much.
+        block_dim: threads of a block on the GPU.
+        tile: rows and columns of pixels that neighbouring threads trace; ``(1, 1)`` for row by row.
+        options: further options of ``mjx.create_render_context``.
+
+    Raises:
+        RenderError: the scenery has no such camera.
+    """
+
+    def __init__(
+        self,
+        scenery: Scenery,
+        *,
+        height: int = 256,
+        width: int = 256,
+        cameras: Sequence[str] = POLICY_CAMERAS,
+        rgb: bool = True,
+        depth: bool = False,
+        segmentation: bool = False,
+        samples: int = 1,
+        block_dim: int = BLOCK,
+        tile: tuple[int, int] = TILE,
+        **options: Any,
+    ) -> None:
+        self.scenery, self.height, self.width, self.cameras = scenery, height, width, tuple(cameras)
+        self._wanted = rgb, depth, segmentation
+        self._model = model = scenery.model
+        self._camera_ids = [_camera(model, name) for name in cameras]
+        self._put = mjx.put_model(model, impl="warp")
+        sizes = self._put._impl.block_dim.__class__(render=block_dim)
+        self._put = self._put.tree_replace({"_impl.block_dim": sizes})
+        self._tile = tile if height % tile[0] == 0 and width % tile[1] == 0 else (1, 1)
+        self._blank = mjx.make_data(model, impl="warp", naconmax=1, njmax=1)
+        # Normals blended over a face are slower and, with simplified meshes, farther from GL.
+        fixed = {"samples_per_pixel": samples, "render_skybox": True, "enable_vertex_normals": False}
+        self._options = {**fixed, **options}
+        self._contexts: dict[int, Any] = {}
+        self._look = Sized(self._look_at, self._context)
+
+    def look(self, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array) -> Seen:
+        """What the cameras of one world see.
+
+        Args:
+            xpos: positions of the bodies of the physics model, world frame, metres, [nbody, 3].
+            xquat: their orientations, wxyz, [nbody, 4].
+            qpos: [nq], read for what glows while a joint is turned.
+        """
+        return self._look(xpos, xquat, qpos)
+
+    def _context(self, num_worlds: int) -> Any:
+        if num_worlds not in self._contexts:
+            rgb, depth, segmentation = self._wanted
+            with jax.ensure_compile_time_eval():
+                context = mjx.create_render_context(
+                    self._model,
+                    nworld=num_worlds,
+                    cam_res=(self.width, self.height),
+                    cam_active=self._camera_ids,
+                    render_rgb=rgb,
+                    render_depth=depth,
+                    render_seg=segmentation,
+                    enabled_geom_groups=[1],
+                    **self._options,
+                )
+                self._tile_rays(render_context.get(context.pytree()))
+                self._contexts[num_worlds] = context
+        return self._contexts[num_worlds].pytree()
+
+    def _tile_rays(self, context: Any) -> None:
+        """Put a render context's rays, which are row by row for each camera and sample, into the order of tiles."""
+        (rows, columns), rays = self._tile, context.ray.numpy()
+        tiled = rays.reshape(-1, self.height // rows, rows, self.width // columns, columns, 3).swapaxes(2, 3)
+        context.ray.assign(np.ascontiguousarray(tiled).reshape(rays.shape))
+
+    def _image(self, buffer: jax.Array) -> jax.Array:
+        """Images [C, H, W, ...] as delivered, of a buffer [C * H * W, ...] in the order of tiles."""
+        (rows, columns), rest = self._tile, buffer.shape[1:]
+        tiles = buffer.reshape(-1, self.height // rows, self.width // columns, rows, columns, *rest)
+        return tiles.swapaxes(2, 3).reshape(-1, self.height, self.width, *rest)[:, :, ::-1]
+
+    def _look_at(self, context: Any, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array) -> Seen:
+        model = self._put.replace(geom_rgba=self._colors(qpos))
+        data = mjx.refit_bvh(model, self._posed(xpos, xquat), context)
+        if self._wanted[2]:
+            rgb, depth, segmentation, _ = mjx.render_with_segmentation(model, data, context)
+            return self._delivered(rgb, depth, segmentation)
+        rgb, depth, _ = mjx.render(model, data, context)
+        return self._delivered(rgb, depth, None)
+
+    def _posed(self, xpos: jax.Array, xquat: jax.Array) -> mjx.Data:
+        model = self._model
+        mats = jax.vmap(quat_to_mat)(xquat.astype(jnp.float32))
+        xpos = xpos.astype(jnp.float32)
+
+        def place(body: np.ndarray, pos: np.ndarray, own: np.ndarray) -> tuple[jax.Array, jax.Array]:
+            turn = mats[body]
+            return xpos[body] + _times(turn, jnp.asarray(pos, jnp.float32)[..., None])[..., 0], _times(
+                turn, jnp.asarray(own, jnp.float32)
+            )
+
+        geom_xpos, geom_xmat = place(model.geom_bodyid, model.geom_pos, _matrices(model.geom_quat))
+        cam_xpos, cam_xmat = place(model.cam_bodyid, model.cam_pos, _matrices(model.cam_quat))
+        light_xpos, light_xdir = place(model.light_bodyid, model.light_pos, model.light_dir[..., None])
+        return self._blank.tree_replace(
+            {
+                "geom_xpos": geom_xpos,
+                "geom_xmat": geom_xmat,
+                "cam_xpos": cam_xpos,
+                "cam_xmat": cam_xmat,
+                "_impl.light_xpos": light_xpos,
+                "_impl.light_xdir": light_xdir[..., 0],
+            }
+        )
+
+    def _colors(self, qpos: jax.Array) -> jax.Array:
+        """Colours of the geoms; what does not glow has alpha 0, which rays pass."""
+        rgba = jnp.asarray(self._model.geom_rgba)
+        for burner in self.scenery.burners:
+            turned = burner.sign * qpos[np.array(burner.knobs)]
+            is_on = (turned >= burner.bound if burner.inclusive else turned > burner.bound).any()
+            rgba = rgba.at[burner.geom, 3].set(jnp.where(is_on, rgba[burner.geom, 3], 0.0))
+        return rgba
+
+    def _delivered(self, rgb: jax.Array, depth: jax.Array, segmentation: jax.Array | None) -> Seen:
+        """Of the renderer's flat buffers of all cameras."""
+        wants_rgb, wants_depth, _ = self._wanted
+        return Seen(
+            rgb=_unpacked(self._image(rgb.reshape(-1))) if wants_rgb else None,
+            depth=self._image(depth.reshape(-1)) if wants_depth else None,
+            segmentation=None if segmentation is None else self._instances(self._image(segmentation.reshape(-1, 2))),
+        )
+
+    def _instances(self, codes: jax.Array) -> jax.Array:
+        """Of the geom and object type [..., 2] of each pixel."""
+        table = jnp.asarray(np.append(self.scenery.instance_of_geom, np.int16(0)))
+        return table[codes[..., 0]]  # -1 is nothing, the table's last
+
+
+class RayRenderer:
+    """Renders batches as ``vecenv.render.gl.GlRenderer`` does, without GL: one call of ``RayTracer`` for each scene.
+
+    Args:
+        config: sizes and level of detail.
+    """
+
+    def __init__(self, config: RenderConfig) -> None:
+        self._config = config
+        self._looks: dict[tuple, Any] = {}
+
+    def render(
+        self,
+        shots: Sequence[Shot],
+        problems: Sequence[Problem],
+        models: Sequence[mujoco.MjModel],
+        cameras: Sequence[str],
+        wanted: Wanted,
+    ) -> Frames:
+        """Render every slot through every camera.
+
+        Args:
+            shots: one a slot; their stages count through ``problems``.
+            problems, models: the scenes and their physics models.
+            cameras: names of the scenes' cameras.
+            wanted: which images.
+
+        Raises:
+            RenderError: a scene has no such camera, or a slot has visual options.
+        """
+        if any(shot.options != VisualOptions() for shot in shots):
+            raise RenderError("engine='raytrace' knows no visual options; use engine='gl'")
+        size = (len(shots), self._config.height, self._config.width)
+        rgb = {name: np.zeros((*size, 3), np.uint8) for name in cameras if wanted.rgb}
+        depth = {name: np.zeros(size, np.float32) for name in cameras if wanted.depth}
+        segmentation = {name: np.zeros(size, np.int16) for name in cameras if wanted.segmentation}
+        for stage, (problem, model) in enumerate(zip(problems, models, strict=True)):
+            slots = [slot for slot, shot in enumerate(shots) if shot.stage == stage]
+            seen = self._look(problem, tuple(cameras), wanted)(*_states(model, [shots[slot].pose for slot in slots]))
+            for images, made in ((rgb, seen.rgb), (depth, seen.depth), (segmentation, seen.segmentation)):
+                for number, name in enumerate(cameras if images else ()):
+                    images[name][slots] = np.asarray(made[:, number])
+        return Frames(rgb, depth, segmentation, {})
+
+    def close(self) -> None:
+        """Forget what was compiled. Closing twice is harmless."""
+        self._looks = {}
+
+    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> Any:
+        key = (problem.scene_key(), cameras, wanted)
+        if key not in self._looks:
+            rays = RayTracer(
+                installed_scenery(problem, self._config.lod),
+                height=self._config.height,
+                width=self._config.width,
+                cameras=cameras,
+                rgb=wanted.rgb,
+                depth=wanted.depth,
+                segmentation=wanted.segmentation,
+            )
+            self._looks[key] = jax.jit(jax.vmap(rays.look))
+        return self._looks[key]
+
+
+def _states(model: mujoco.MjModel, shown: Sequence[Pose]) -> tuple[np.ndarray, ...]:
+    qpos, body_pos, body_quat = (
+        np.stack([getattr(pose, name) for pose in shown]) for name in ("qpos", "body_pos", "body_quat")
+    )
+    return (*poses(model, qpos, body_pos, body_quat), qpos.astype(np.float32))
+
+
+def poses(
+    model: mujoco.MjModel, qpos: np.ndarray, body_pos: np.ndarray, body_quat: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the bodies of B worlds are, for ``RayTracer.look``, where no MJX computed it.
+
+    Args:
+        model: the physics model.
+        qpos: [B, nq].
+        body_pos, body_quat: poses of the bodies in their parents, [B, nbody, 3] and [B, nbody, 4].
+
+    Returns:
+        Positions [B, nbody, 3] and orientations wxyz [B, nbody, 4], world frame, float32.
+    """
+    own, data = copy.copy(model), mujoco.MjData(model)
+    xpos, xquat = np.zeros(body_pos.shape, np.float32), np.zeros(body_quat.shape, np.float32)
+    for world in range(len(qpos)):
+        own.body_pos[:], own.body_quat[:], data.qpos[:] = body_pos[world], body_quat[world], qpos[world]
+        mujoco.mj_kinematics(own, data)
+        xpos[world], xquat[world] = data.xpos, data.xquat
+    return xpos, xquat
+
+
+def _camera(model: mujoco.MjModel, name: str) -> int:
+    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, ALIASES.get(name, name))
+    if found < 0:
+        there = ", ".join(model.camera(index).name for index in range(model.ncam))
+        raise RenderError(f"no camera {name!r}; this scene has {there}")
+    return found
+
+
+def _matrices(quats: np.ndarray) -> np.ndarray:
+    """Rotation matrices [n, 3, 3] of quaternions wxyz [n, 4]."""
+    out = np.zeros((len(quats), 9))
+    for row, quat in zip(out, quats, strict=True):
+        mujoco.mju_quat2Mat(row, quat)
+    return out.reshape(-1, 3, 3)
+
+
+def _times(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Matrix products in full precision: GPUs round the factors of ``@`` to ten bits."""
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+
+
+def _unpacked(packed: jax.Array) -> jax.Array:
+    """uint8 [..., 3] of 0xAARRGGBB."""
+    return jnp.stack([(packed >> shift).astype(jnp.uint8) for shift in (16, 8, 0)], axis=-1)
