@@ -23,8 +23,9 @@ from vecenv.render import lod
 # Largest error in metres by level: of the gripper, which fills a third of the wrist image, of what it handles, and of
 # what stands at least a metre away.
 ERRORS = {"exact": (0.00001, 0.000015, 0.000015), "fast": (0.0002, 0.00035, 0.0007)}
-# Strips of a weave are not much thicker than that: share of the error for meshes of these names.
-WOVEN, WOVEN_SHARE = ("basket",), 0.7
+# Share of the error for meshes of these names: strips of a weave are not much thicker than it, and the highlights of a
+# shiny black bowl move with every normal.
+FINER = {"basket": 0.7, "akita_black_bowl": 0.4}
 # Texture in pieces shows errors sooner: this many vertices a place or more, and this share of the error.
 PATCHY, PATCHY_SHARE = 1.25, {"exact": 1.0, "fast": 0.3}
 # How many metres of error a difference of 1 counts as: in texture coordinates, as a share of the mesh's diagonal (a
@@ -89,7 +90,7 @@ def _error(mesh: str, entities: tuple[str, ...], level: str) -> float:
     if mesh.startswith("gripper0_"):
         return tool
     if mesh.startswith((*entities, "robot0_")) and not mesh.startswith(_FAR_NAMES):
-        return near * (WOVEN_SHARE if mesh.startswith(WOVEN) else 1)
+        return near * next((share for name, share in FINER.items() if mesh.startswith(name)), 1.0)
     return far
 
 
