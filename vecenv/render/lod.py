@@ -24,7 +24,7 @@ FILE = "simplified.npz"
 STORED = ("exact", "fast")
 # Meshes of fewer triangles are drawn whole: there is little to gain and, close to the wrist camera, a knob's shade to
 # lose (38 dB).
-LEAST = {"exact": 6000, "fast": 600}
+LEAST = {"exact": 6000, "fast": 0}
 # Normals are stored as whole numbers up to this.
 NORMAL_SCALE = 127
 
