@@ -27,3 +27,19 @@ def _cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None
 def repository() -> Path:
     """The clone these tests lie in."""
     return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small generated asset tree for SIMPLER; not to be written to."""
+    import simpler_assets_small
+
+    return simpler_assets_small.build(tmp_path_factory.mktemp("small"))
+
+
+@pytest.fixture(scope="session")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """SIMPLER's own assets without what is only drawn; skips the test where there is no archive of them."""
+    from simpler_files import physics_files
+
+    return physics_files(tmp_path_factory.mktemp("original"))

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import simpler_assets_small
 from typer.testing import CliRunner
 
 from eval.runner import ConfigError, EvalConfig, Evaluation, begin, default_policy, evaluate, go_on
@@ -15,11 +14,6 @@ from vecenv.cli import build_app
 
 pytest.importorskip("sapien")
 BRIDGE, GOOGLE = "simpler/bridge", "simpler/google_robot"
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simpler_assets_small.build(tmp_path_factory.mktemp("small"))
 
 
 @pytest.fixture(autouse=True)

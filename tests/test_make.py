@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import simpler_assets_small
 
 import vecenv
 from vecenv.actions import GRIPPER
@@ -22,11 +21,6 @@ from vecenv.simpler.robots import GOOGLE_ROBOT, WIDOWX
 
 BRIDGE, GOOGLE = "simpler/bridge", "simpler/google_robot"
 SPOON, COKE = "widowx_spoon_on_towel", "google_robot_pick_coke_can"
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simpler_assets_small.build(tmp_path_factory.mktemp("small"))
 
 
 # -- lists -------------------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 
 import httpx
 import pytest
-from simpler_files import SHARED
+from simpler_files import ARCHIVE
 from typer.testing import CliRunner
 
 from vecenv.assets import AssetsMissing
@@ -589,10 +589,9 @@ def test_the_command_names_what_it_cannot_use(tmp_path: Path) -> None:
 
 
 def test_the_archive_beside_the_repository_holds_all_but_nine_files(root: Path) -> None:
-    archive = SHARED / "simpler_assets.tar.xz"
-    if not archive.is_file():
+    if not ARCHIVE.is_file():
         pytest.skip("no archive of SIMPLER's assets beside the repository")
-    report = pull.pull(root, str(archive))
+    report = pull.pull(root, str(ARCHIVE))
     assert report.complete
     assert (len(report.fetched), len(report.stand_ins)) == (286, 9)
     assert {path.name for path in report.missing if path.suffix == ".glb"} == {

@@ -10,14 +10,12 @@ import json
 import os
 import subprocess
 import sys
-import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import simpler_assets_small
-from simpler_files import GOOGLE_ROLLOUTS, SEEDS, SHARED, WIDOWX_ROLLOUTS, rollouts
+from simpler_files import GOOGLE_ROLLOUTS, SEEDS, WIDOWX_ROLLOUTS, rollouts
 
 from vecenv.contract import ImagesUnavailable, State
 from vecenv.simpler.kinematics import rotation_from_quat
@@ -32,26 +30,9 @@ from vecenv.simpler import hulls, scenes, workers
 from vecenv.simpler import judge as judging
 from vecenv.simpler.env import SimplerEnv, SimplerError, make
 
-ARCHIVE = SHARED / "simpler_assets.tar.xz"
 CARROT, OPEN_TOP, COKE = "widowx_carrot_on_plate", "google_robot_open_top_drawer", "google_robot_pick_coke_can"
 PLACE = "google_robot_place_apple_in_closed_top_drawer"
 STAY = np.zeros(7)
-
-
-@pytest.fixture(scope="session")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simpler_assets_small.build(tmp_path_factory.mktemp("small"))
-
-
-@pytest.fixture(scope="session")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if not ARCHIVE.is_file():
-        pytest.skip("no archive of SIMPLER's assets beside the repository")
-    folder = tmp_path_factory.mktemp("original")
-    with tarfile.open(ARCHIVE) as archive:
-        chosen = [member for member in archive if not member.name.endswith((".png", ".jpg", ".dae", ".glb"))]
-        archive.extractall(folder, chosen, filter="data")
-    return folder
 
 
 @pytest.fixture(params=["small", "original"])

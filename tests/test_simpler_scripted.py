@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import tarfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-import simpler_assets_small
-from simpler_files import SHARED
 
 pytest.importorskip("sapien")
 pytest.importorskip("ruckig")
@@ -24,25 +21,8 @@ from vecenv.simpler.robots import GOOGLE_ROBOT, WIDOWX, controller
 from vecenv.simpler.servo import Servo, ServoConfig
 from vecenv.simpler.tasks import TASKS
 
-ARCHIVE = SHARED / "simpler_assets.tar.xz"
 QPOS = np.array([-0.01840777, 0.0398835, 0.22242722, -0.00460194, 1.36524296, 0.00153398, 0.037, 0.037])
 BASE = np.array([0.147, 0.028, 0.87, 0, 0, 0, 1.0])
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simpler_assets_small.build(tmp_path_factory.mktemp("small"))
-
-
-@pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if not ARCHIVE.is_file():
-        pytest.skip("no archive of SIMPLER's assets beside the repository")
-    folder = tmp_path_factory.mktemp("original")
-    with tarfile.open(ARCHIVE) as archive:
-        chosen = [member for member in archive if not member.name.endswith((".png", ".jpg", ".dae", ".glb"))]
-        archive.extractall(folder, chosen, filter="data")
-    return folder
 
 
 @pytest.fixture(scope="module")

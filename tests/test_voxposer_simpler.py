@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tarfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import simpler_assets_small
-from simpler_files import SHARED
 
 import vecenv
 from voxposer import simpler_scene
@@ -22,11 +19,6 @@ from voxposer.world import HOME_ROTATION, World, matrix
 
 pytest.importorskip("sapien")
 BRIDGE = "simpler/bridge"
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simpler_assets_small.build(tmp_path_factory.mktemp("small"))
 
 
 @pytest.fixture
@@ -105,17 +97,11 @@ def test_other_environments_are_left_as_they_are_and_other_robots_refused() -> N
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("task", range(4))
-def test_the_rule_based_model_solves_an_episode_of_every_task(task: int, tmp_path: Path) -> None:
+def test_the_rule_based_model_solves_an_episode_of_every_task(task: int, original: Path) -> None:
     from eval.policies import make_policy
     from eval.runner import drive
 
-    archive = SHARED / "simpler_assets.tar.xz"
-    if not archive.is_file():
-        pytest.skip("no archive of SIMPLER's assets beside the repository")
-    with tarfile.open(archive) as files:
-        chosen = [member for member in files if not member.name.endswith((".png", ".jpg", ".dae", ".glb"))]
-        files.extractall(tmp_path, chosen, filter="data")
-    env = vecenv.make(BRIDGE, task=task, episodes=[0, 2], assets=tmp_path, num_threads=1)
+    env = vecenv.make(BRIDGE, task=task, episodes=[0, 2], assets=original, num_threads=1)
     policy = make_policy("voxposer")
     policy.reset(env, env.reset())
     for _ in drive(env, policy):
