@@ -73,11 +73,18 @@ def theirs(python: str, task: str, pictures: bool) -> float:
     return float(done.stdout.split()[-1])
 
 
-def batch(task: str, slots: int, workers: int) -> float:
-    """Control ticks of all slots a wall second, without pictures."""
+def batch(task: str, slots: int, workers: int, pictures: bool) -> float:
+    """Control ticks of all slots a wall second; with pictures, one of every slot after each tick."""
     env = running(task, slots, workers)
+    chunk = actions(slots, BATCH_TICKS)
+    if pictures:
+        _ = env.observe_egocentric().rgb
     begin = time.perf_counter()
-    env.step_continuous(actions(slots, BATCH_TICKS))
+    for tick in range(BATCH_TICKS) if pictures else ():
+        env.step_continuous(chunk[:, tick])
+        _ = env.observe_egocentric().rgb
+    if not pictures:
+        env.step_continuous(chunk)
     rate = slots * BATCH_TICKS / (time.perf_counter() - begin)
     env.close()
     return round(rate, 1)
@@ -103,19 +110,26 @@ def main() -> None:
     parser.add_argument("--slots", type=int, nargs="*", default=[1, 8, 32, 64])
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--repeats", type=int, default=2)
-    parser.add_argument("--only-batches", action="store_true", help="leave one slot against upstream out")
+    parser.add_argument("--only", choices=("one", "batches"), help="one slot against upstream, or batches")
+    parser.add_argument("--name", default="simpler_batches", help="of the batches' rows in the results folder")
     chosen = parser.parse_args()
-    if not chosen.only_batches:
+    if chosen.only != "batches":
         rows = compare(chosen.peer, False, chosen.repeats)
         rows += compare(chosen.peer, True, chosen.repeats) if chosen.pictures else []
         common.report("simpler_speed", rows, title="SIMPLER, one slot: control ticks a CPU second")
-    batches = [
-        {"task": task, "slots": slots, "workers": workers, "ticks_per_wall_second": batch(task, slots, workers)}
-        for task in PAIR
-        for slots in chosen.slots
-        for workers in chosen.workers
-    ]
-    common.report("simpler_batches", batches, title="SIMPLER, batches: control ticks a second of all slots")
+    if chosen.only == "one":
+        return
+    batches = []
+    for task in PAIR:
+        for slots in chosen.slots:
+            for workers in (count for count in chosen.workers if count <= slots):
+                row: dict[str, Any] = {"task": task, "slots": slots, "workers": workers}
+                row["ticks a second"] = batch(task, slots, workers, False)
+                if chosen.pictures:
+                    row["with pictures"] = batch(task, slots, workers, True)
+                batches.append(row)
+                print(row, flush=True)
+    common.report(chosen.name, batches, title="SIMPLER, batches: control ticks a second of all slots")
 
 
 if __name__ == "__main__":
