@@ -1,8 +1,9 @@
 """Control steps a second on MJX, controller and verdicts included, against a bare loop of ``mjx.step`` in the same run.
 
-For every scene, geometry and batch size: the environment runs chunks of random actions; the bare loop steps the same
-number of substeps from the same states, with the last commands held and the same memory. Both are compiled; the two
-take turns. Also: seconds to compile, device memory, and how many worlds ran out of contact or constraint memory.
+For every scene, geometry and batch size: the environment runs a chunk of random actions; the bare loop steps the same
+number of substeps through the same states with the same memory: every control tick begins where the environment's
+began and holds the commands with which it ended, so both meet the same contacts. Both are compiled; the two take turns.
+Also: seconds to compile, device memory, and how many worlds ran out of contact or constraint memory.
 
 With ``--devices N`` the batch is spread over N devices, and the other side is one device with its share of it.
 """
@@ -27,7 +28,7 @@ from mujoco import mjx
 import vecenv
 from vecenv.libero.env import LiberoEnv
 from vecenv.physics.base import SUBSTEPS
-from vecenv.physics.mjx import MjxGroup, jit
+from vecenv.physics.mjx import MjxGroup, World, control_step, jit
 
 CHUNK = 10
 # How XLA, CUDA and Warp say it.
@@ -82,7 +83,9 @@ def measure(scene: str, geometry: str, batch: int, options: argparse.Namespace) 
             "ready s": round(ready, 1),
             "compile s": round(compile_seconds, 1),
         }
-    theirs, _ = timed_first(bare(group))
+    start = jax.tree.map(jnp.copy, group.worlds)
+    ours, _ = timed_first(environment(group, start))
+    theirs, _ = timed_first(bare(group, start))
     rates = alternate([ours, theirs], options.rounds, options.seconds)
     failed = int((np.asarray(group.worlds.fault) != 0).sum())
     row = {
@@ -145,35 +148,45 @@ def compare_devices(
     }
 
 
-def environment(group: MjxGroup) -> Callable[[], Any]:
-    """Run a chunk: a random action held for some ticks, then its opposite; the state goes on from call to call."""
+def there_and_back(group: MjxGroup) -> jax.Array:
+    """Actions [B, CHUNK, 7]: a random one held for some ticks, then its opposite."""
+    there = np.random.default_rng(0).uniform(-1, 1, (len(group.slots), 1, 7))
+    held = np.repeat(there, CHUNK // 2, axis=1)
+    return group.put(np.concatenate([held, -held], axis=1))
+
+
+def environment(group: MjxGroup, start: World | None = None) -> Callable[[], Any]:
+    """Run a chunk, each time from ``start``; without it the state goes on from call to call."""
     n = len(group.slots)
-    there = np.random.default_rng(0).uniform(-1, 1, (n, 1, 7))
-    actions = np.concatenate([np.repeat(there, CHUNK // 2, axis=1), np.repeat(-there, CHUNK // 2, axis=1)], axis=1)
-    chunk, active, limit = group.put(actions), group.put_mask(np.ones(n, bool)), group.put(np.full(n, 10**6))
+    chunk, active, limit = there_and_back(group), group.put_mask(np.ones(n, bool)), group.put(np.full(n, 10**6))
 
     def run() -> Any:
         assert group.table is not None
-        loop = group.compiled.run(group.system, group.table, group.worlds, chunk, active, limit)
+        worlds = group.worlds if start is None else jax.tree.map(jnp.copy, start)
+        loop = group.compiled.run(group.system, group.table, worlds, chunk, active, limit)
         group.replace(loop.worlds)
         return loop.ticks
 
     return run
 
 
-def bare(group: MjxGroup) -> Callable[[], Any]:
-    """Step the physics alone from the same states, commands held."""
+def bare(group: MjxGroup, start: World) -> Callable[[], Any]:
+    """Step the physics alone through the ticks of the same chunk."""
+    act = jax.vmap(control_step, in_axes=(None, 0, 0))
     step = jax.vmap(mjx.step, in_axes=(None, 0))
 
-    def many(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        return lax.scan(lambda d, _: (step(model, d), None), data, None, length=SUBSTEPS * CHUNK)[0]
+    def tick(worlds: World, action: jax.Array) -> tuple[World, tuple[jax.Array, ...]]:
+        after = act(group.system, worlds, action)
+        return after, (worlds.data.qpos, worlds.data.qvel, after.data.ctrl)
 
-    compiled, start = jit(many), jax.tree.map(jnp.copy, group.worlds.data)
+    def bare_tick(data: mjx.Data, given: tuple[jax.Array, ...]) -> tuple[mjx.Data, None]:
+        qpos, qvel, ctrl = given
+        data = data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl)
+        return lax.scan(lambda d, _: (step(group.system.model, d), None), data, None, length=SUBSTEPS)[0], None
 
-    def run() -> Any:
-        return compiled(group.system.model, start).qpos
-
-    return run
+    ticks = jit(lambda worlds, actions: lax.scan(tick, worlds, actions)[1])(start, there_and_back(group).swapaxes(0, 1))
+    many = jit(lambda data, ticks: lax.scan(bare_tick, data, ticks)[0].qpos)
+    return lambda: many(start.data, ticks)
 
 
 def timed_first(run: Callable[[], Any]) -> tuple[Callable[[], Any], float]:

@@ -4,7 +4,8 @@ Three stages, so that the GPU machine needs no LIBERO packages and no native phy
 the native backend with upstream's geometry and writes one file a suite: starts, what moves in 50 idle ticks, actions,
 verdicts, where objects end. ``compare`` gives every backend and geometry the same starts and actions: one batch a
 scene, in which every episode is there once idle and twice replayed (the second tells how far MJX repeats itself).
-``table`` puts what ``compare`` wrote into Markdown.
+``table`` puts what ``compare`` wrote into Markdown. The backend ``nudged`` is the yardstick: native once more, every
+action moved by what single precision rounds away; what that changes, no float32 backend can be asked to keep.
 
 Scenes are compiled and run by worker processes; a scene that fails or hangs is reported and the others go on. Results
 are written after every scene, and a second run does what is missing.
@@ -55,6 +56,8 @@ CAP = 400
 GRACE = 20
 # Positions of starts that differ by more than this are other starts (float32 keeps 1e-7), metres.
 SAME_START = 1e-5
+# Standard deviation of what is added to the actions of the backend "nudged": an ulp of a float32 near 1.
+NUDGE = 1e-7
 DOC = ROOT / "docs" / "mjx_fidelity_table.md"
 NAME = "mjx_fidelity"
 
@@ -357,7 +360,7 @@ def open_job(job: Job, setup: Setup, recording: Recording, rows: np.ndarray, **o
         job.suite,
         tasks=list(job.tasks),
         episodes=episodes,
-        backend=job.backend,
+        backend=physics_of(job.backend),
         geometry=job.geometry,
         scenes=setup.scenes,
         **options,
@@ -368,6 +371,11 @@ def open_job(job: Job, setup: Setup, recording: Recording, rows: np.ndarray, **o
     if not apart < SAME_START:
         raise RecordingError(f"{job.scene}: starts are {apart:.2g} m from those recorded; record again")
     return env
+
+
+def physics_of(backend: str) -> str:
+    """What steps a job of this backend."""
+    return "native" if backend == "nudged" else backend
 
 
 IDLE, FIRST, SECOND = range(3)
@@ -405,9 +413,11 @@ def commands(recording: Recording, rows: np.ndarray, roles: np.ndarray) -> tuple
 def replayed(job: Job, setup: Setup, recording: Recording, rows: np.ndarray) -> Row:
     """Settle and replay; everything in one batch and one call."""
     recording = recording if setup.ticks is None else recording.within(setup.ticks)
-    roles = (IDLE, FIRST) if job.backend == "native" else (IDLE, FIRST, SECOND)
+    roles = (IDLE, FIRST) if physics_of(job.backend) == "native" else (IDLE, FIRST, SECOND)
     slots, role = slots_of(recording.task, rows, roles)
     chunk, limit = commands(recording, slots, role)
+    if job.backend == "nudged":
+        chunk[..., :6] += np.random.default_rng(0).normal(scale=NUDGE, size=chunk[..., :6].shape)
     clock = Clock()
     env = open_job(job, setup, recording, slots)
     clock.lap("ready")
@@ -421,7 +431,7 @@ def replayed(job: Job, setup: Setup, recording: Recording, rows: np.ndarray) -> 
     scene = env.physics.groups[0].scene
     names = [entity.name for entity in scene.objects]
     again = None
-    if job.suite in setup.again and job.backend != "native":
+    if job.suite in setup.again and physics_of(job.backend) != "native":
         begin_again(env)
         again = spread_of_runs(part(end, role == FIRST), part(run(env, chunk, limit), role == FIRST))
     env.close()
@@ -544,7 +554,7 @@ def spread(values: np.ndarray) -> list[float]:
 
 def device(backend: str) -> str:
     """What the physics ran on."""
-    if backend == "native":
+    if physics_of(backend) == "native":
         return "cpu"
     import jax
 
@@ -894,7 +904,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     stage.add_argument("recordings", type=Path, help="folder of the recordings")
     stage.add_argument("--task", nargs="+", type=int, help="only these tasks of each suite, to look into something")
     stage.add_argument("--ticks", type=int, help="end every replayed episode after this many, on both sides")
-    stage.add_argument("--backend", nargs="+", default=["warp"], choices=("warp", "jax", "native"))
+    stage.add_argument("--backend", nargs="+", default=["warp"], choices=("warp", "jax", "native", "nudged"))
     stage.add_argument("--geometry", nargs="+", default=["exact", "lean"], choices=("exact", "lean"))
     stage.add_argument("--closed-loop", nargs="+", choices=SUITES, default=[], help="suites to play closed-loop too")
     stage.add_argument(
