@@ -120,9 +120,10 @@ def record(task: str, episodes: int, kind: str) -> list[dict[str, Any]]:
     seen = np.zeros(env.num_envs, int)
 
     def keep() -> None:
+        steps = env.evaluate().num_steps
         for slot, rollout in enumerate(rollouts):
-            if env._steps[slot] > seen[slot]:
-                seen[slot] = env._steps[slot]
+            if steps[slot] > seen[slot]:
+                seen[slot] = steps[slot]
                 verdict = env._verdicts[slot]
                 rollout["states"].append(state(env, slot))
                 rollout["ours"].append(

@@ -146,7 +146,7 @@ class _Slots:
 
     def __init__(self, env: LiberoEnv, episodes: Any, obs: str | Sequence[str]) -> None:
         self.env, self.observe = env, _Observer(env, obs)
-        placed = env._placement
+        placed = env.placement
         self._rotations = [
             _Rotation(_pool(placed, int(task), episodes), int(first))
             for task, first in zip(placed.task, placed.episode, strict=True)
@@ -159,12 +159,7 @@ class _Slots:
     def begin(self, mask: np.ndarray, episode: Any = None) -> dict[str, np.ndarray]:
         """Begin the next or the given episode in some slots; the others go on. Returns what there is to say of them."""
         slots = np.flatnonzero(mask)
-        current = self.env._placement
-        chosen = current.episode.copy()
-        chosen[slots] = self._given(episode)[slots] if episode is not None else self._next(slots)
-        # What set_episodes does, but for some of the slots alone.
-        self.env._placement = placement.Placement(current.task, chosen)
-        self.env._live[slots] = False
+        self.env.set_some_episodes(slots, self._next(slots) if episode is None else self._given(episode)[slots])
         info = self.env.reset()
         return {"episode_id": np.array(info.episode_id, object), "instruction": np.array(info.instruction, object)}
 
@@ -173,7 +168,7 @@ class _Slots:
 
     def _given(self, episode: Any) -> np.ndarray:
         counts = {"num_tasks": 1, "num_episodes": NUM_EPISODES}
-        return placement.each(None, episode, self.env._placement, **counts).episode
+        return placement.each(None, episode, self.env.placement, **counts).episode
 
     def step(self, actions: Any) -> tuple[Control, dict[str, np.ndarray]]:
         """One tick; finished slots ignore it. Returns what there is to say of it as well."""

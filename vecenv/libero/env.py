@@ -8,8 +8,7 @@ their start states, goals and instructions, which are data. Read ``vecenv/contra
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,17 +20,13 @@ from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv.contract import (
     Control,
-    EePoseControl,
     Egocentric,
-    Metrics,
     Objects,
     ObjectsSnapshot,
     Part,
     PartJoint,
-    PlanControl,
     PointCloud,
     RegionBox,
-    ResetInfo,
     State,
 )
 from vecenv.controllers import waypoint
@@ -46,11 +41,12 @@ from vecenv.libero.scene import Scene
 from vecenv.libero.sources import Task, installed_tasks
 from vecenv.libero.suites import NUM_EPISODES
 from vecenv.physics import budgets
-from vecenv.physics.base import Followed, Group, Physics, Ran, Start, Watcher
+from vecenv.physics.base import Group, Physics, Start
 from vecenv.physics.budgets import Budget
 from vecenv.physics.build import BACKENDS, make_physics
 from vecenv.render.eyes import Eyes, options_of
 from vecenv.render.options import RenderConfig, VisualOptions
+from vecenv.slots import SlotBatch
 
 # What LIBERO evaluations send while objects settle after a reset: no motion, gripper open.
 SETTLE_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
@@ -138,8 +134,11 @@ class _TaskData:
     scene: int
 
 
-class LiberoEnv:
+class LiberoEnv(SlotBatch):
     """A batch of LIBERO episodes; see ``vecenv.make``.
+
+    ``step_ee_pose`` moves at most 5 mm and 0.05 rad a tick (``config.waypoint``). Its poses are those of the grip
+    site's position and the hand's orientation.
 
     Args:
         suite: one of ``vecenv.list_suites()``.
@@ -151,45 +150,39 @@ class LiberoEnv:
         LiberoError, SceneError, GoalError, FixtureError, TaskDataError: something the options ask for does not exist.
     """
 
+    _error = LiberoError
+
     def __init__(self, suite: str, tasks: Sequence[Task], placement: placing.Placement, config: LiberoConfig) -> None:
-        self.suite, self.config = suite, config
-        self.num_envs = len(placement)
+        super().__init__(suite, len(placement))
+        self.config = config
         self._sources = tasks
-        self._closed = False
         self._physics: Physics | None = None
-        self._watchers: list[Watcher] = []
         self._eyes = Eyes(config.render, self.num_envs)
         self._place(placement)
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
-        """Choose what each slot runs next; ``reset`` makes it live.
+    def set_some_episodes(self, slots: Any, episodes: Any) -> None:
+        """Choose what some slots run next, of the task they have; ``reset`` begins it, and the others go on.
 
         Args:
-            tasks: task index of each slot (B of them, or one for all); None keeps them.
-            episodes: init state of each slot, likewise.
+            slots: their indices, or bool [B].
+            episodes: init state of each of them, or one for all.
 
         Raises:
-            PlacementError: an index that does not exist, or a wrong number of them.
+            PlacementError: an episode that does not exist.
         """
         self._check_open()
+        chosen = self._placement.episode.copy()
+        chosen[slots] = episodes
+        self._placement = self._chosen(None, chosen)
+        self._live[slots] = False
+
+    def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
         counts = {"num_tasks": len(self._sources), "num_episodes": NUM_EPISODES}
-        self._place(placing.each(tasks, episodes, self._placement, **counts))
+        return placing.each(tasks, episodes, self._placement, **counts)
 
-    def _place(self, placement: placing.Placement) -> None:
-        self._placement = placement
-        self._build()
-        b = self.num_envs
-        self._live = np.zeros(b, bool)
-        self._terminated = np.zeros(b, bool)
-        self._truncated = np.zeros(b, bool)
-        self._success = np.zeros(b, bool)
-        self._steps = np.zeros(b, int)
-        self._reward = np.zeros(b)
-        self._fault = [""] * b
-
-    def _build(self) -> None:
+    def _prepare(self) -> np.ndarray:
         """Scenes, physics and goal tables for the current placement; what still fits is kept."""
         indices = np.unique(self._placement.task)
         problems = {int(i): self._sources[i].problem() for i in indices}
@@ -212,6 +205,7 @@ class LiberoEnv:
                 budgets=[self._budget_of(key, scene) for key, scene in zip(keys, scenes, strict=True)],
             )
         self._physics.set_goals([self._goal_table(group) for group in self._physics.groups])
+        return np.full(self.num_envs, self.config.max_steps)
 
     def _scene(self, key: SceneKey, problems: Mapping[int, Problem]) -> Scene:
         """The scene of this key, for those of the problems that share it."""
@@ -256,26 +250,11 @@ class LiberoEnv:
         rows = [present.index(int(task)) for task in tasks]
         return goals.build_table([self._tasks[task].problem for task in present], group.scene, rows)
 
-    def reset(self) -> ResetInfo:
-        """Make every slot live: finished slots are re-armed in place, live ones are left alone.
+    def _instruction(self, slot: int) -> str:
+        return self._tasks[int(self._placement.task[slot])].source.instruction
 
-        Returns:
-            Episode metadata of every slot; no observation.
-        """
-        self._check_open()
-        stale = ~self._live | self._done
-        if stale.any():
-            self._arm(stale)
-        return ResetInfo(
-            instruction=tuple(self._tasks[int(task)].source.instruction for task in self._placement.task),
-            episode_id=tuple(
-                f"{self.suite}/{task}/{episode}"
-                for task, episode in zip(self._placement.task, self._placement.episode, strict=True)
-            ),
-            suite=self.suite,
-            task_id=self._placement.task.copy(),
-            max_steps=np.full(self.num_envs, self.config.max_steps),
-        )
+    def _label(self, task: int) -> str:
+        return str(task)
 
     def _arm(self, stale: np.ndarray) -> None:
         for group in self.physics.groups:
@@ -283,15 +262,9 @@ class LiberoEnv:
                 slots = group.slots[(self._placement.task[group.slots] == task) & stale[group.slots]]
                 if len(slots):
                     self.physics.place(group, slots, self._start(group.scene, int(task), slots))
-        for array in (self._terminated, self._truncated, self._success, self._steps, self._reward):
-            array[stale] = 0
-        for slot in np.flatnonzero(stale):
-            self._fault[slot] = ""
-        self._live |= stale
         settle = np.tile(SETTLE_ACTION, (self.num_envs, 1))
         for _ in range(self.config.settle_steps if self.config.start == "raw" else 0):
             self.physics.control_step(settle, stale)
-        self._quarantine(stale)
 
     def _start(self, scene: Scene, task: int, slots: np.ndarray) -> Start:
         data = self._tasks[task]
@@ -357,124 +330,23 @@ class LiberoEnv:
         chunk, mended = action_space.continuous(actions, self.num_envs)
         before = self._steps.copy()
         ran = self.physics.run(chunk, ~self._done, self._ticks_left, self._watchers)
-        return self._control(Control, self._book(ran), mended, before)
-
-    @contextmanager
-    def watched(self, watcher: Watcher) -> Iterator[None]:
-        """While inside, ``watcher(actions [B, 7], active bool [B])`` is called before every tick of an episode.
-
-        It sees what any verb executes, ``step_ee_pose`` included; settling is not part of an episode.
-        """
-        self._watchers.append(watcher)
-        try:
-            yield
-        finally:
-            self._watchers.remove(watcher)
+        return self._control(Control, self._book(ran.ticks, ran.success), before, mended)
 
     @property
     def _ticks_left(self) -> np.ndarray:
-        return self.config.max_steps - self._steps
+        return self._max_steps - self._steps
 
-    def _book(self, ran: Ran) -> np.ndarray:
-        """Enter what the slots did; returns its rewards [B]."""
-        active = ran.ticks > 0
-        self._steps += ran.ticks
-        self._success[active] = ran.success[active]
-        self._terminated |= ran.success
-        self._truncated |= active & ~ran.success & (self._steps >= self.config.max_steps)
-        self._quarantine(active)
-        reward = np.where(active & self._success, 1.0, 0.0)
-        self._reward += reward
-        return reward
+    def _failures(self) -> Mapping[int, str]:
+        return self.physics.faults
 
-    def _quarantine(self, among: np.ndarray) -> None:
-        for slot, reason in self.physics.faults.items():
-            if among[slot] and not self._fault[slot]:
-                self._fault[slot] = reason
-                self._truncated[slot] = True
-                self._terminated[slot] = self._success[slot] = False
+    def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        poses = waypoint.Pose(targets[:, None, :3], targets[:, None, 3:7])
+        plan = waypoint.Plan(poses, targets[:, 7:], hold[:, None], moves[:, None])
+        reward, arrived, _ = self._follow(plan)
+        return reward, arrived[:, 0]
 
-    def _control(self, kind: type, reward: np.ndarray, mended: np.ndarray, before: np.ndarray, **extra: Any) -> Any:
-        return kind(
-            reward=reward,
-            terminated=self._terminated.copy(),
-            truncated=self._truncated.copy(),
-            success=self._success.copy(),
-            step_index=self._steps.copy(),
-            info={"mended": mended, "fault": tuple(self._fault), "ticks": self._steps - before},
-            **extra,
-        )
-
-    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
-        """Drive each end effector to an absolute pose, or hold it while the gripper moves.
-
-        Every slot advances on its own, at most 5 mm and 0.05 rad a tick, until it is within tolerance, finished, or
-        out of ticks (``config.waypoint``); it uses at least one tick, so the gripper command is always given.
-        ``hold_steps`` > 0 skips the drive: that many ticks without motion. Poses are those of the grip site's position
-        and the hand's orientation, the frame ``observe_egocentric`` and ``observe_objects`` report.
-
-        Args:
-            poses: [B, 8] xyz (metres), wxyz, grip (1 closed, 0 open), world frame; empty for a no-op. Also a mapping
-                with ``pose`` and ``hold_steps``.
-            hold_steps: ticks to hold, one number or [B].
-
-        Raises:
-            ActionError: not numbers, or another shape.
-        """
-        self._check_live()
-        if isinstance(poses, Mapping):
-            poses, hold_steps = poses.get("pose", ()), poses.get("hold_steps", hold_steps)
-        targets: Any
-        targets, moves, errors = action_space.ee_poses(poses, self.num_envs)
-        hold = action_space.hold_steps(hold_steps, self.num_envs)
-        before = self._steps.copy()
-        plan = waypoint.Plan(
-            waypoint.Pose(targets[:, None, :3], targets[:, None, 3:7]), targets[:, 7:], hold[:, None], moves[:, None]
-        )
-        followed = self._follow(plan)
-        return self._control(
-            EePoseControl,
-            self._book(followed),
-            np.zeros(self.num_envs, bool),
-            before,
-            converged=followed.converged[:, 0] & moves,
-            final_pose=np.concatenate(self.physics.eef(), axis=1),
-            step_count=self._steps - before,
-            error=errors,
-        )
-
-    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
-        """Follow a plan of waypoints, each slot its own, in one call.
-
-        A slot goes from waypoint to waypoint as ``step_ee_pose`` does, without stopping, and ends at the end of its
-        plan, on success, when its budget is spent, or after ``max_misses`` waypoints in a row out of reach.
-
-        Args:
-            plan: anything with ``poses`` [B, T, 7] (xyz in metres, wxyz, world frame), ``grip`` [B, T] (1 closed, 0
-                open), ``hold`` int [B, T] (ticks without motion in place of the drive; 0 drives) and ``valid``
-                bool [B, T] (the others are skipped).
-            max_misses: None never gives up.
-
-        Raises:
-            ActionError: not numbers, or another shape.
-        """
-        self._check_live()
-        before = self._steps.copy()
-        checked, errors = action_space.plan(plan, self.num_envs)
-        followed = self._follow(checked, max_misses)
-        return self._control(
-            PlanControl,
-            self._book(followed),
-            np.zeros(self.num_envs, bool),
-            before,
-            converged=followed.converged,
-            waypoint_ticks=followed.waypoint_ticks,
-            final_pose=np.concatenate(self.physics.eef(), axis=1),
-            error=errors,
-        )
-
-    def _follow(self, plan: waypoint.Plan, max_misses: int | None = None) -> Followed:
-        return self.physics.follow(
+    def _follow(self, plan: waypoint.Plan, max_misses: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        followed = self.physics.follow(
             plan,
             ~self._done,
             self._ticks_left,
@@ -482,6 +354,10 @@ class LiberoEnv:
             max_misses=max_misses,
             watchers=self._watchers,
         )
+        return self._book(followed.ticks, followed.success), followed.converged, followed.waypoint_ticks
+
+    def _tools(self) -> np.ndarray:
+        return np.concatenate(self.physics.eef(), axis=1)
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
@@ -573,17 +449,6 @@ class LiberoEnv:
             parts=parts,
         )
 
-    def evaluate(self) -> Metrics:
-        """The verdict of each slot as of its last executed tick."""
-        self._check_open()
-        return Metrics(
-            success=self._success.copy(),
-            num_steps=self._steps.copy(),
-            suite=self.suite,
-            task_id=self._placement.task.copy(),
-            cumulative_reward=self._reward.copy(),
-        )
-
     def check_success(self) -> np.ndarray:
         """Whether each slot's goal holds in its present state, bool [B]; unlike ``evaluate`` not tied to a tick."""
         self._check_live()
@@ -669,21 +534,6 @@ class LiberoEnv:
             qpos, qvel = chosen.qpos[slots, : model.nq], chosen.qvel[slots, : model.nv]
             self.physics.write_state(group, qpos, qvel, chosen.time[slots])
         self._quarantine(np.ones(self.num_envs, bool))
-
-    # -- helpers -------------------------------------------------------------------------------------------------------
-
-    @property
-    def _done(self) -> np.ndarray:
-        return self._terminated | self._truncated
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise LiberoError("the environment is closed")
-
-    def _check_live(self) -> None:
-        self._check_open()
-        if not self._live.all():
-            raise LiberoError("call reset() first: it makes the placed episodes live")
 
 
 _SCENERY = ""

@@ -12,8 +12,7 @@ An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,15 +24,12 @@ from vecenv import placement as placing
 from vecenv.contract import (
     CameraView,
     Control,
-    EePoseControl,
     Egocentric,
-    Metrics,
     Objects,
-    PlanControl,
     Rendered,
-    ResetInfo,
     State,
 )
+from vecenv.controllers.waypoint import Plan
 from vecenv.simpler import assets, kinematics, robots
 from vecenv.simpler.episodes import Episode, prepare
 from vecenv.simpler.judge import Judge, Verdict
@@ -44,6 +40,7 @@ from vecenv.simpler.servo import Servo, ServoConfig
 from vecenv.simpler.tasks import NUM_EPISODES, SimplerTask, find_task, list_tasks
 from vecenv.simpler.variants import Variant, make_variant, require_files, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
+from vecenv.slots import SlotBatch
 
 if TYPE_CHECKING:
     from vecenv.simpler.overlay import Painter, Picture
@@ -64,8 +61,6 @@ ACTION_LIMITS = np.array([1.0, 1.0, 1.0, np.pi / 2, np.pi / 2, np.pi / 2, 1.0])
 _CAMERA = "agentview"
 # More objects than any task has.
 _MAX_OBJECTS = 8
-
-Watcher = Callable[[np.ndarray, np.ndarray], None]
 
 
 class SimplerError(ValueError):
@@ -115,8 +110,11 @@ class SimplerConfig:
                 raise SimplerError(f"{name}={value}: need at least 1, or None")
 
 
-class SimplerEnv:
+class SimplerEnv(SlotBatch):
     """A batch of SIMPLER episodes; see ``vecenv.make``.
+
+    ``step_ee_pose`` moves as fast as ``config.servo`` lets it, and where it holds, it holds still where the last call
+    led. Its poses are those of the tool (WidowX ``ee_gripper_link``, Google Robot ``link_gripper_tcp``).
 
     Args:
         suite: ``simpler/bridge`` or ``simpler/google_robot``.
@@ -127,9 +125,11 @@ class SimplerEnv:
         SimplerError, AssetsMissing: something the options ask for does not exist.
     """
 
+    _error = SimplerError
+
     def __init__(self, suite: str, placement: placing.Placement, config: SimplerConfig) -> None:
-        self.suite, self.config = suite, config
-        self.num_envs = len(placement)
+        super().__init__(suite, len(placement))
+        self.config = config
         self.tasks = list_tasks(suite)
         self.robot = self.tasks[0].robot
         self._root = assets.simpler_root(config.assets)
@@ -140,7 +140,6 @@ class SimplerEnv:
         self._settled: dict[tuple[int, int], np.ndarray] = {}
         self._prepared: dict[tuple[int, int], Episode] = {}
         self._chains: dict[str, kinematics.Chain] = {}
-        self._watchers: list[Watcher] = []
         self._painter: Painter | None = None
         self._place(placement)
 
@@ -153,37 +152,16 @@ class SimplerEnv:
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
-        """Choose what each slot runs next; ``reset`` makes it live.
-
-        Args:
-            tasks: task of each slot, by name or index (B of them, or one for all); None keeps them.
-            episodes: episode of each slot, 0 to 49, likewise.
-
-        Raises:
-            PlacementError, UnknownTask: something that does not exist, or a wrong number of them.
-        """
-        self._check_open()
+    def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
         counts = {"num_tasks": len(self.tasks), "num_episodes": NUM_EPISODES}
-        self._place(placing.each(task_indices(self.suite, tasks), episodes, self._placement, **counts))
+        return placing.each(task_indices(self.suite, tasks), episodes, self._placement, **counts)
 
-    def _place(self, placement: placing.Placement) -> None:
-        self._placement = placement
-        b = self.num_envs
-        self._episodes = [
-            self._episode(int(task), int(episode))
-            for task, episode in zip(placement.task, placement.episode, strict=True)
-        ]
-        self._judges: list[Judge | None] = [None] * b
-        self._verdicts = [Verdict(False)] * b
-        self._live = np.zeros(b, bool)
-        self._terminated = np.zeros(b, bool)
-        self._truncated = np.zeros(b, bool)
-        self._success = np.zeros(b, bool)
-        self._steps = np.zeros(b, int)
-        self._reward = np.zeros(b)
-        self._fault = [""] * b
-        self._max_steps = np.array([self.config.max_steps or each.task.max_steps for each in self._episodes])
+    def _prepare(self) -> np.ndarray:
+        """Episodes and verdicts for the current placement."""
+        self._episodes = [self._episode(*self._key(slot)) for slot in range(self.num_envs)]
+        self._judges: list[Judge | None] = [None] * self.num_envs
+        self._verdicts = [Verdict(False)] * self.num_envs
+        return np.array([self.config.max_steps or each.task.max_steps for each in self._episodes])
 
     def _episode(self, task: int, episode: int) -> Episode:
         key, chosen = (task, episode), self.tasks[task]
@@ -195,35 +173,13 @@ class SimplerEnv:
             self._prepared[key] = prepare(chosen, layout, self._root)
         return self._prepared[key]
 
-    def reset(self) -> ResetInfo:
-        """Make every slot live: finished slots are re-armed in place, live ones are left alone.
-
-        Returns:
-            Episode metadata of every slot; no observation.
-        """
-        self._check_open()
-        stale = ~self._live | self._done
-        if stale.any():
-            self._arm(stale)
-        tasks, episodes = self._placement.task, self._placement.episode
-        return ResetInfo(
-            instruction=self.instructions(),
-            episode_id=tuple(
-                f"{self.suite}/{self.tasks[task].name}/{episode}" for task, episode in zip(tasks, episodes, strict=True)
-            ),
-            suite=self.suite,
-            task_id=tasks.copy(),
-            max_steps=self._max_steps.copy(),
-        )
-
-    def instructions(self) -> tuple[str, ...]:
-        """What each slot's policy is told at present; tasks in two halves have two instructions."""
-        return tuple(self._instruction(slot) for slot in range(self.num_envs))
-
     def _instruction(self, slot: int) -> str:
         layout, judge = self._episodes[slot].layout, self._judges[slot]
         second = judge is not None and judge.second_half(int(self._steps[slot]) + 1)
         return layout.second_instruction if second else layout.instruction
+
+    def _label(self, task: int) -> str:
+        return self.tasks[task].name
 
     def advance_subtask(self, slots: Any = None) -> None:
         """Tell slots (bool [B], all by default) of tasks in two halves that the first half is done."""
@@ -240,14 +196,9 @@ class SimplerEnv:
             self._settled.setdefault(self._key(int(slot)), settled[int(slot)])
             episode = self._episodes[slot]
             self._judges[slot] = Judge(episode.task, episode.roles, self._facts[slot])
-            self._fault[slot] = ""
             self._verdicts[slot] = Verdict(False)
-        for array in (self._terminated, self._truncated, self._success, self._steps, self._reward):
-            array[stale] = 0
         self._controller.reset(stale, self._facts["qpos"])
         self._servo.forget(stale)
-        self._live |= stale
-        self._quarantine(stale)
 
     def _key(self, slot: int) -> tuple[int, int]:
         return int(self._placement.task[slot]), int(self._placement.episode[slot])
@@ -267,6 +218,7 @@ class SimplerEnv:
         if self._painter is not None:
             self._painter.close()
         self._slots = self._painter = None
+        self._closed = True
 
     # -- stepping ------------------------------------------------------------------------------------------------------
 
@@ -288,7 +240,7 @@ class SimplerEnv:
             if self._done.all():
                 break
             reward += self._tick(chunk[:, tick], ~self._done)
-        return self._control(Control, reward, mended, before)
+        return self._control(Control, reward, before, mended)
 
     def _native_gripper(self, values: np.ndarray) -> np.ndarray:
         return values if self.config.gripper == "native" else self._servo.gripper(values)
@@ -300,94 +252,30 @@ class SimplerEnv:
         facts = self._facts
         points = self._controller.set_action(actions, facts["qpos"], facts["qvel"], active)
         self.slots.run(active, points.position, points.velocity)
-        self._steps += active
+        success = np.zeros(self.num_envs, bool)
         for slot in np.flatnonzero(active):
-            self._judge(int(slot))
-        self._terminated |= active & self._success
-        self._truncated |= active & ~self._success & (self._steps >= self._max_steps)
-        self._quarantine(active)
-        reward = np.where(active & self._success, 1.0, 0.0)
-        self._reward += reward
-        return reward
+            success[slot] = self._judge(int(slot))
+        return self._book(active, success)
 
-    def _judge(self, slot: int) -> None:
+    def _judge(self, slot: int) -> bool:
+        """Whether a slot succeeds with the tick that was just run."""
         judge = self._judges[slot]
         if judge is None or self.slots.faults[slot]:
-            return
-        self._verdicts[slot] = judge.after(self._facts[slot], int(self._steps[slot]))
-        self._success[slot] = self._verdicts[slot].success
+            return False
+        self._verdicts[slot] = judge.after(self._facts[slot], int(self._steps[slot]) + 1)
+        return self._verdicts[slot].success
 
-    def _quarantine(self, among: np.ndarray) -> None:
-        for slot in np.flatnonzero(among):
-            reason = self.slots.faults[slot]
-            if reason and not self._fault[slot]:
-                self._fault[slot] = reason
-                self._truncated[slot] = True
-                self._terminated[slot] = self._success[slot] = False
+    def _failures(self) -> Mapping[int, str]:
+        return {slot: reason for slot, reason in enumerate(self.slots.faults) if reason}
 
-    def _control(self, kind: type, reward: np.ndarray, mended: np.ndarray, before: np.ndarray, **extra: Any) -> Any:
-        return kind(
-            reward=reward,
-            terminated=self._terminated.copy(),
-            truncated=self._truncated.copy(),
-            success=self._success.copy(),
-            step_index=self._steps.copy(),
-            info={
-                "mended": mended,
-                "fault": tuple(self._fault),
-                "ticks": self._steps - before,
-                "parts": tuple(verdict.parts for verdict in self._verdicts),
-                "stand_ins": tuple(episode.notes for episode in self._episodes),
-            },
-            **extra,
-        )
+    def _diagnostics(self) -> dict[str, Any]:
+        return {"parts": tuple(verdict.parts for verdict in self._verdicts), "stand_ins": self.stand_ins}
 
-    @contextmanager
-    def watched(self, watcher: Watcher) -> Iterator[None]:
-        """While inside, ``watcher(actions [B, 7], active bool [B])`` is called before every tick of any verb."""
-        self._watchers.append(watcher)
-        try:
-            yield
-        finally:
-            self._watchers.remove(watcher)
+    def _tools(self) -> np.ndarray:
+        return self._facts["tcp"].copy()
 
-    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
-        """Drive each tool to an absolute pose, or hold it while the gripper moves.
-
-        Every slot goes on its own, as fast as ``config.servo`` lets it, until it is within tolerance, finished, or out
-        of ticks; it uses at least one tick, so the gripper command is always given. ``hold_steps`` > 0 skips the drive:
-        that many ticks holding still where the last call led. Poses are those of the tool (WidowX
-        ``ee_gripper_link``, Google Robot ``link_gripper_tcp``), the frame ``observe_objects`` reports.
-
-        Args:
-            poses: [B, 8] xyz (metres), wxyz, grip (1 closed, 0 open), world frame; empty for a no-op. Also a mapping
-                with ``pose`` and ``hold_steps``.
-            hold_steps: ticks to hold, one number or [B].
-
-        Raises:
-            ActionError: not numbers, or another shape.
-        """
-        self._check_live()
-        if isinstance(poses, Mapping):
-            poses, hold_steps = poses.get("pose", ()), poses.get("hold_steps", hold_steps)
-        targets, moves, errors = action_space.ee_poses(poses, self.num_envs)
-        hold = action_space.hold_steps(hold_steps, self.num_envs)
-        before, reward = self._steps.copy(), np.zeros(self.num_envs)
-        converged = self._follow(targets, hold, moves, reward)
-        return self._control(
-            EePoseControl,
-            reward,
-            np.zeros(self.num_envs, bool),
-            before,
-            converged=converged & moves,
-            final_pose=self._facts["tcp"].copy(),
-            step_count=self._steps - before,
-            error=errors,
-        )
-
-    def _follow(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray, reward: np.ndarray) -> np.ndarray:
-        """Drive or hold the slots in ``moves``; adds to ``reward`` and returns which are at their target, bool [B]."""
-        servo, driving = self._servo, hold == 0
+    def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        servo, driving, reward = self._servo, hold == 0, np.zeros(self.num_envs)
         servo.begin(self._facts["tcp"])
         ticks = np.where(driving, servo.config.max_steps, hold)
         going, used, arrived = moves & ~self._done, np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
@@ -398,37 +286,11 @@ class SimplerEnv:
             arrived = servo.arrived(targets, self._facts["tcp"])
             stuck = servo.stuck(targets, self._facts["tcp"], driving & going)
             going = going & ~self._done & (used < ticks) & ~(driving & arrived) & ~stuck
-        return arrived
+        return reward, arrived
 
-    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
-        """Follow a plan of waypoints, each slot its own, in one call.
-
-        A slot goes from waypoint to waypoint as ``step_ee_pose`` does and ends at the end of its plan, on success, when
-        its budget is spent, or after ``max_misses`` waypoints in a row out of reach.
-
-        Args:
-            plan: anything with ``poses`` [B, T, 7] (xyz in metres, wxyz, world frame), ``grip`` [B, T] (1 closed, 0
-                open), ``hold`` int [B, T] (ticks without motion in place of the drive) and ``valid`` bool [B, T].
-            max_misses: None never gives up.
-
-        Raises:
-            ActionError: not numbers, or another shape.
-        """
-        self._check_live()
-        checked, errors = action_space.plan(plan, self.num_envs)
-        followed = _Followed(self, checked, max_misses)
-        before = self._steps.copy()
-        reward = followed.run()
-        return self._control(
-            PlanControl,
-            reward,
-            np.zeros(self.num_envs, bool),
-            before,
-            converged=followed.converged,
-            waypoint_ticks=followed.ticks,
-            final_pose=self._facts["tcp"].copy(),
-            error=errors,
-        )
+    def _follow(self, plan: Plan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        followed = _Followed(self, plan, max_misses)
+        return followed.run(), followed.converged, followed.ticks
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
@@ -503,17 +365,6 @@ class SimplerEnv:
             error=tuple(f"physics failed: {reason}" if reason else "" for reason in self._fault),
         )
 
-    def evaluate(self) -> Metrics:
-        """The verdict of each slot as of its last executed tick."""
-        self._check_open()
-        return Metrics(
-            success=self._success.copy(),
-            num_steps=self._steps.copy(),
-            suite=self.suite,
-            task_id=self._placement.task.copy(),
-            cumulative_reward=self._reward.copy(),
-        )
-
     @property
     def stand_ins(self) -> tuple[tuple[str, ...], ...]:
         """For each slot, what files are missing and what stands in for them."""
@@ -582,21 +433,6 @@ class SimplerEnv:
         poses, speeds = qpos[joints : joints + 7 * count], qvel[joints : joints + 6 * count]
         things = np.concatenate([poses.reshape(-1, 7), speeds.reshape(-1, 6)], axis=1)
         return np.concatenate([qpos[:dof], qvel[:dof], qpos[dof:joints], qvel[dof:joints], things.ravel()])
-
-    # -- helpers -------------------------------------------------------------------------------------------------------
-
-    @property
-    def _done(self) -> np.ndarray:
-        return self._terminated | self._truncated
-
-    def _check_open(self) -> None:
-        if self._slots is None:
-            raise SimplerError("the environment is closed")
-
-    def _check_live(self) -> None:
-        self._check_open()
-        if not self._live.all():
-            raise SimplerError("call reset() first: it makes the placed episodes live")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,295 @@
+"""What all environments keep about their slots: who is live, who has finished and how, whose physics failed and why.
+
+In: which episode sits in which slot, and from a simulator, ticks, successes and failures. Out: the verbs of
+``vecenv.contract`` that are the same everywhere, and its rules about finished and quarantined slots.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+
+from vecenv import actions as action_space
+from vecenv.contract import Control, EePoseControl, Metrics, PlanControl, ResetInfo
+from vecenv.controllers.waypoint import Plan
+from vecenv.placement import Placement
+
+# Called before a tick: actions [B, 7], and which slots they are for, bool [B].
+Watcher = Callable[[np.ndarray, np.ndarray], None]
+
+_Kind = TypeVar("_Kind", bound=Control)
+
+
+class SlotBatch(ABC):
+    """A batch of slots, each with one episode of one task; a subclass supplies the simulator and the other verbs.
+
+    Args:
+        suite: the suite the tasks are of.
+        num_envs: slots, B.
+    """
+
+    # What calls that cannot be honoured raise.
+    _error: ClassVar[type[ValueError]]
+
+    def __init__(self, suite: str, num_envs: int) -> None:
+        self.suite, self.num_envs = suite, num_envs
+        self._closed = False
+        self._watchers: list[Watcher] = []
+
+    # -- what the simulator supplies -----------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _chosen(self, tasks: Any, episodes: Any) -> Placement:
+        """The present placement with other tasks and episodes, as ``set_episodes`` takes them."""
+
+    @abstractmethod
+    def _prepare(self) -> np.ndarray:
+        """Get ready for ``_placement``; returns the step budget of each slot, int [B]."""
+
+    @abstractmethod
+    def _arm(self, stale: np.ndarray) -> None:
+        """Put the slots ``stale`` (bool [B]) at the start of their episodes."""
+
+    @abstractmethod
+    def _instruction(self, slot: int) -> str:
+        """What a slot's policy is told at present."""
+
+    @abstractmethod
+    def _label(self, task: int) -> str:
+        """What a task is called in ``episode_id``."""
+
+    @abstractmethod
+    def _failures(self) -> Mapping[int, str]:
+        """Why the physics of slots failed, by slot; those that are healthy are left out."""
+
+    @abstractmethod
+    def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Drive the slots ``moves`` (bool [B]) to ``targets`` [B, 8], or hold them for ``hold`` ticks (int [B]).
+
+        Returns:
+            Rewards [B], and who arrived, bool [B].
+        """
+
+    @abstractmethod
+    def _follow(self, plan: Plan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Follow a plan; returns rewards [B], and of each waypoint who arrived, bool [B, T], and its ticks [B, T]."""
+
+    @abstractmethod
+    def _tools(self) -> np.ndarray:
+        """Poses of the end effectors, xyz (metres) and wxyz, world frame, [B, 7], a copy."""
+
+    def _diagnostics(self) -> dict[str, Any]:
+        """What ``info`` holds besides what it always holds."""
+        return {}
+
+    # -- episodes ------------------------------------------------------------------------------------------------------
+
+    @property
+    def placement(self) -> Placement:
+        """Task and episode of each slot."""
+        return self._placement
+
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+        """Choose what each slot runs next; ``reset`` makes it live.
+
+        Args:
+            tasks: task of each slot, by index or in SIMPLER also by name (B of them, or one for all); None keeps them.
+            episodes: episode of each slot, 0 to 49, likewise.
+
+        Raises:
+            PlacementError, UnknownTask: something that does not exist, or a wrong number of them.
+        """
+        self._check_open()
+        self._place(self._chosen(tasks, episodes))
+
+    def _place(self, placement: Placement) -> None:
+        self._placement = placement
+        self._max_steps = self._prepare()
+        b = self.num_envs
+        self._live = np.zeros(b, bool)
+        self._terminated = np.zeros(b, bool)
+        self._truncated = np.zeros(b, bool)
+        self._success = np.zeros(b, bool)
+        self._steps = np.zeros(b, int)
+        self._reward = np.zeros(b)
+        self._fault = [""] * b
+
+    def reset(self) -> ResetInfo:
+        """Make every slot live: finished slots are re-armed in place, live ones are left alone.
+
+        Returns:
+            Episode metadata of every slot; no observation.
+        """
+        self._check_open()
+        stale = ~self._live | self._done
+        if stale.any():
+            self._arm(stale)
+            self._begin(stale)
+        tasks, episodes = self._placement.task, self._placement.episode
+        return ResetInfo(
+            instruction=self.instructions(),
+            episode_id=tuple(
+                f"{self.suite}/{self._label(int(task))}/{episode}"
+                for task, episode in zip(tasks, episodes, strict=True)
+            ),
+            suite=self.suite,
+            task_id=tasks.copy(),
+            max_steps=self._max_steps.copy(),
+        )
+
+    def _begin(self, stale: np.ndarray) -> None:
+        for array in (self._terminated, self._truncated, self._success, self._steps, self._reward):
+            array[stale] = 0
+        for slot in np.flatnonzero(stale):
+            self._fault[slot] = ""
+        self._live |= stale
+        self._quarantine(stale)
+
+    def instructions(self) -> tuple[str, ...]:
+        """What each slot's policy is told at present; in SIMPLER, tasks in two halves have two instructions."""
+        return tuple(self._instruction(slot) for slot in range(self.num_envs))
+
+    # -- stepping ------------------------------------------------------------------------------------------------------
+
+    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+        """Drive each end effector to an absolute pose, or hold it while the gripper moves.
+
+        Every slot goes on its own until it is within tolerance, finished, or out of ticks; it uses at least one tick,
+        so the gripper command is always given. ``hold_steps`` > 0 skips the drive: that many ticks without motion.
+        Poses are of the frame that ``observe_objects`` reports as ``ee_pose``; the class says which that is.
+
+        Args:
+            poses: [B, 8] xyz (metres), wxyz, grip (1 closed, 0 open), world frame; empty for a no-op. Also a mapping
+                with ``pose`` and ``hold_steps``.
+            hold_steps: ticks to hold, one number or [B].
+
+        Raises:
+            ActionError: not numbers, or another shape.
+        """
+        self._check_live()
+        if isinstance(poses, Mapping):
+            poses, hold_steps = poses.get("pose", ()), poses.get("hold_steps", hold_steps)
+        targets, moves, errors = action_space.ee_poses(poses, self.num_envs)
+        hold = action_space.hold_steps(hold_steps, self.num_envs)
+        before = self._steps.copy()
+        reward, arrived = self._drive(targets, hold, moves)
+        return self._control(
+            EePoseControl,
+            reward,
+            before,
+            converged=arrived & moves,
+            final_pose=self._tools(),
+            step_count=self._steps - before,
+            error=errors,
+        )
+
+    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
+        """Follow a plan of waypoints, each slot its own, in one call.
+
+        A slot goes from waypoint to waypoint as ``step_ee_pose`` does, without stopping, and ends at the end of its
+        plan, on success, when its budget is spent, or after ``max_misses`` waypoints in a row out of reach.
+
+        Args:
+            plan: anything with ``poses`` [B, T, 7] (xyz in metres, wxyz, world frame), ``grip`` [B, T] (1 closed, 0
+                open), ``hold`` int [B, T] (ticks without motion in place of the drive; 0 drives) and ``valid``
+                bool [B, T] (the others are skipped).
+            max_misses: None never gives up.
+
+        Raises:
+            ActionError: not numbers, or another shape.
+        """
+        self._check_live()
+        checked, errors = action_space.plan(plan, self.num_envs)
+        before = self._steps.copy()
+        reward, arrived, ticks = self._follow(checked, max_misses)
+        return self._control(
+            PlanControl,
+            reward,
+            before,
+            converged=arrived,
+            waypoint_ticks=ticks,
+            final_pose=self._tools(),
+            error=errors,
+        )
+
+    @contextmanager
+    def watched(self, watcher: Watcher) -> Iterator[None]:
+        """While inside, ``watcher(actions [B, 7], active bool [B])`` is called before every tick of an episode.
+
+        It sees what any verb executes, ``step_ee_pose`` included; settling is not part of an episode.
+        """
+        self._watchers.append(watcher)
+        try:
+            yield
+        finally:
+            self._watchers.remove(watcher)
+
+    def _book(self, ticks: np.ndarray, success: np.ndarray) -> np.ndarray:
+        """Enter how many ticks each slot took, int or bool [B], and the verdict after them; returns its rewards [B]."""
+        active = ticks > 0
+        self._steps += ticks
+        self._success[active] = success[active]
+        self._terminated |= active & success
+        self._truncated |= active & ~success & (self._steps >= self._max_steps)
+        self._quarantine(active)
+        # A slot that failed on its way to success has none, and earns nothing.
+        reward = np.where(active & self._success, 1.0, 0.0)
+        self._reward += reward
+        return reward
+
+    def _quarantine(self, among: np.ndarray) -> None:
+        for slot, reason in self._failures().items():
+            if among[slot] and not self._fault[slot]:
+                self._fault[slot] = reason
+                self._truncated[slot] = True
+                self._terminated[slot] = self._success[slot] = False
+
+    def _control(
+        self, kind: type[_Kind], reward: np.ndarray, before: np.ndarray, mended: np.ndarray | None = None, **extra: Any
+    ) -> _Kind:
+        """What a step returns: ``before`` are the steps that slots had taken, ``mended`` is nowhere unless given."""
+        info = {
+            "mended": np.zeros(self.num_envs, bool) if mended is None else mended,
+            "fault": tuple(self._fault),
+            "ticks": self._steps - before,
+            **self._diagnostics(),
+        }
+        return kind(
+            reward=reward,
+            terminated=self._terminated.copy(),
+            truncated=self._truncated.copy(),
+            success=self._success.copy(),
+            step_index=self._steps.copy(),
+            info=info,
+            **extra,
+        )
+
+    # -- verdicts ------------------------------------------------------------------------------------------------------
+
+    def evaluate(self) -> Metrics:
+        """The verdict of each slot as of its last executed tick."""
+        self._check_open()
+        return Metrics(
+            success=self._success.copy(),
+            num_steps=self._steps.copy(),
+            suite=self.suite,
+            task_id=self._placement.task.copy(),
+            cumulative_reward=self._reward.copy(),
+        )
+
+    @property
+    def _done(self) -> np.ndarray:
+        return self._terminated | self._truncated
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise self._error("the environment is closed")
+
+    def _check_live(self) -> None:
+        self._check_open()
+        if not self._live.all():
+            raise self._error("call reset() first: it makes the placed episodes live")
