@@ -73,21 +73,22 @@ def theirs(python: str, task: str, pictures: bool) -> float:
     return float(done.stdout.split()[-1])
 
 
-def batch(task: str, slots: int, workers: int, pictures: bool) -> float:
-    """Control ticks of all slots a wall second; with pictures, one of every slot after each tick."""
+def batch(task: str, slots: int, workers: int, pictures: bool) -> dict[str, float]:
+    """Control ticks of all slots a wall second; with pictures too: one of every slot after each tick."""
     env = running(task, slots, workers)
     chunk = actions(slots, BATCH_TICKS)
+    begin = time.perf_counter()
+    env.step_continuous(chunk)
+    rates = {"ticks a second": slots * BATCH_TICKS / (time.perf_counter() - begin)}
     if pictures:
         _ = env.observe_egocentric().rgb
-    begin = time.perf_counter()
-    for tick in range(BATCH_TICKS) if pictures else ():
-        env.step_continuous(chunk[:, tick])
-        _ = env.observe_egocentric().rgb
-    if not pictures:
-        env.step_continuous(chunk)
-    rate = slots * BATCH_TICKS / (time.perf_counter() - begin)
+        begin = time.perf_counter()
+        for tick in range(BATCH_TICKS):
+            env.step_continuous(chunk[:, tick])
+            _ = env.observe_egocentric().rgb
+        rates["with pictures"] = slots * BATCH_TICKS / (time.perf_counter() - begin)
     env.close()
-    return round(rate, 1)
+    return {name: round(rate, 1) for name, rate in rates.items()}
 
 
 def compare(peer: str | None, pictures: bool, repeats: int) -> list[dict[str, Any]]:
@@ -123,12 +124,9 @@ def main() -> None:
     for task in PAIR:
         for slots in chosen.slots:
             for workers in (count for count in chosen.workers if count <= slots):
-                row: dict[str, Any] = {"task": task, "slots": slots, "workers": workers}
-                row["ticks a second"] = batch(task, slots, workers, False)
-                if chosen.pictures:
-                    row["with pictures"] = batch(task, slots, workers, True)
-                batches.append(row)
-                print(row, flush=True)
+                rates = batch(task, slots, workers, chosen.pictures)
+                batches.append({"task": task, "slots": slots, "workers": workers, **rates})
+                print(batches[-1], flush=True)
     common.report(chosen.name, batches, title="SIMPLER, batches: control ticks a second of all slots")
 
 

@@ -8,11 +8,13 @@ and take it along. Where along the edge and at which angles is decided by rehear
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from eval.policies.simpler_reach import Arm, Waypoint, pose, through
-from vecenv.contract import Part
+from vecenv.contract import Part, PartJoint
 from vecenv.simpler.kinematics import rotvec_from_rotation
 
 # Angles of the closed fingers, radians: below the horizontal, and sideways.
@@ -39,51 +41,51 @@ _PREFER_NEAR = 0.15
 _ROOM_ENOUGH = 0.3
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Facing:
+    """One way to face a drawer: angles, where along its front, approach [3] and rotation [3, 3] of the hand."""
+
+    pitch: float
+    yaw: float
+    place: float
+    approach: np.ndarray
+    turn: np.ndarray
+
+
 def hook_and_pull(arm: Arm, qpos: np.ndarray, base: np.ndarray, drawer: Part, opened: float) -> list[Waypoint]:
     """Open a drawer until its joint is at ``opened``, metres; the hand ends where it can leave upwards."""
-    joint = drawer.joint
-    assert joint is not None, "a drawer has a joint"
-    edge = _upper_edge(drawer)
-    ways, turns, dear = [], [], []
-    for pitch, yaw, place, flip in itertools.product(_HOOK_PITCHES, _YAWS, _PLACES, (1.0, -1.0)):
-        approach, turn = _facing(arm, pitch, yaw, flip)
-        behind = (_HOOKED + arm.hand.thickness / np.cos(pitch)) / np.tan(pitch)
-        tip = np.array([edge[0, 0] - behind, _along(edge, place), edge[1, 2] - _HOOKED])
-        at = tip - arm.hand.tip * approach
+    joint, edge = _joint(drawer), _upper_edge(drawer)
+
+    def way(facing: _Facing) -> list[np.ndarray]:
+        behind = (_HOOKED + arm.hand.thickness / np.cos(facing.pitch)) / np.tan(facing.pitch)
+        tip = np.array([edge[0, 0] - behind, _along(edge, facing.place), edge[1, 2] - _HOOKED])
+        at = tip - arm.hand.tip * facing.approach
         over, pressed = at + [0, 0, _OVER], at - [0, 0, _PRESS]
         pulled = pressed + (opened + _SLACK - joint.opened) * joint.axis
-        before, outside = (over - share * _BEFORE * approach for share in _ENTRY)
+        before, outside = (over - share * _BEFORE * facing.approach for share in _ENTRY)
         inside = np.array([*outside[:2], over[2] + _SAGS])
-        ways.append([before, inside, over, at, pulled, pulled + [0, 0, 2 * _OVER]])
-        turns.append(turn)
-        dear.append(_PREFER_STRAIGHT * abs(yaw) + _PREFER_MIDDLE * abs(place))
-    stops, turn = _best(arm, qpos, base, np.array(ways), np.array(turns), np.array(dear))
+        return [before, inside, over, at, pulled, pulled + [0, 0, 2 * _OVER]]
+
+    stops, turn = _best(arm, qpos, base, _HOOK_PITCHES, way)
     return through(stops, turn, 1.0)
 
 
 def push(arm: Arm, qpos: np.ndarray, base: np.ndarray, drawer: Part) -> list[Waypoint]:
     """Close a drawer."""
-    joint = drawer.joint
-    assert joint is not None, "a drawer has a joint"
-    edge = _upper_edge(drawer)
-    ways, turns, dear = [], [], []
-    for pitch, yaw, place, flip in itertools.product(_PUSH_PITCHES, _YAWS, _PLACES, (1.0, -1.0)):
-        approach, turn = _facing(arm, pitch, yaw, flip)
-        tip = np.array([edge[1, 0], _along(edge, place), edge[1, 2] - 2 * arm.hand.thickness])
-        at = tip - arm.hand.tip * approach
-        ways.append([at + _AWAY * joint.axis, at, at - (joint.opened + _BEYOND) * joint.axis])
-        turns.append(turn)
-        dear.append(_PREFER_STRAIGHT * abs(yaw) + _PREFER_MIDDLE * abs(place))
-    stops, turn = _best(arm, qpos, base, np.array(ways), np.array(turns), np.array(dear))
-    last = Waypoint(pose(stops[-1], turn), 1.0, hold=3)
-    return [*through(stops, turn, 1.0), last]
+    joint, edge = _joint(drawer), _upper_edge(drawer)
+
+    def way(facing: _Facing) -> list[np.ndarray]:
+        tip = np.array([edge[1, 0], _along(edge, facing.place), edge[1, 2] - 2 * arm.hand.thickness])
+        at = tip - arm.hand.tip * facing.approach
+        return [at + _AWAY * joint.axis, at, at - (joint.opened + _BEYOND) * joint.axis]
+
+    stops, turn = _best(arm, qpos, base, _PUSH_PITCHES, way)
+    return [*through(stops, turn, 1.0), Waypoint(pose(stops[-1], turn), 1.0, hold=3)]
 
 
 def opening(drawer: Part) -> np.ndarray:
     """Middle of the part of a drawer that is out, at the height of its front's upper edge, [3]."""
-    joint = drawer.joint
-    assert joint is not None, "a drawer has a joint"
-    edge = _upper_edge(drawer)
+    joint, edge = _joint(drawer), _upper_edge(drawer)
     back = np.array([edge[0, 0], edge[:, 1].mean(), edge[1, 2]])
     return back - joint.opened / 2 * joint.axis
 
@@ -95,21 +97,34 @@ def contains(drawer: Part, point: np.ndarray) -> bool:
 
 
 def _best(
-    arm: Arm, qpos: np.ndarray, base: np.ndarray, ways: np.ndarray, turns: np.ndarray, dear: np.ndarray
+    arm: Arm,
+    qpos: np.ndarray,
+    base: np.ndarray,
+    pitches: np.ndarray,
+    way: Callable[[_Facing], list[np.ndarray]],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stops [T, 3] and rotation [3, 3] of the way that leaves most room."""
+    """Stops [T, 3] and rotation [3, 3] of the way that leaves most room, among all ways to face a drawer."""
+    facings = [_facing(arm, *each) for each in itertools.product(pitches, _YAWS, _PLACES, (1.0, -1.0))]
+    ways, turns = np.array([way(each) for each in facings]), np.array([each.turn for each in facings])
     room, _ = arm.rehearse(qpos, base, ways, np.repeat(turns[:, None], ways.shape[1], axis=1))
-    _, facing = arm.tool(qpos, base)
-    far = np.linalg.norm(rotvec_from_rotation(turns @ facing.T), axis=1)
+    _, now = arm.tool(qpos, base)
+    far = np.linalg.norm(rotvec_from_rotation(turns @ now.T), axis=1)
+    dear = np.array([_PREFER_STRAIGHT * abs(each.yaw) + _PREFER_MIDDLE * abs(each.place) for each in facings])
     best = int(np.argmax(np.minimum(room, _ROOM_ENOUGH) - dear - _PREFER_NEAR * far))
     return ways[best], turns[best]
 
 
-def _facing(arm: Arm, pitch: float, yaw: float, flip: float) -> tuple[np.ndarray, np.ndarray]:
-    """Approach against the drawers' axis, which is x, and rotation of a hand that opens sideways."""
+def _facing(arm: Arm, pitch: float, yaw: float, place: float, flip: float) -> _Facing:
+    """Against the drawers' axis, which is x; the hand opens sideways, either way round."""
     approach = np.array([-np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)])
     opening = flip * np.cross([0.0, 0.0, 1.0], approach)
-    return approach, arm.hand.rotation(approach, opening / np.linalg.norm(opening))
+    turn = arm.hand.rotation(approach, opening / np.linalg.norm(opening))
+    return _Facing(pitch=pitch, yaw=yaw, place=place, approach=approach, turn=turn)
+
+
+def _joint(drawer: Part) -> PartJoint:
+    assert drawer.joint is not None, "a drawer has a joint"
+    return drawer.joint
 
 
 def _upper_edge(drawer: Part) -> np.ndarray:

@@ -72,6 +72,8 @@ class Memory:
 
 
 Script: TypeAlias = Generator[list[Waypoint], Look, None]
+# Part of a script that ends with a thing in the hand, and a look at it; or with None.
+Taking: TypeAlias = Generator[list[Waypoint], Look, Look | None]
 
 
 def put_on(arm: Arm, look: Look, memory: Memory) -> Script:
@@ -80,49 +82,35 @@ def put_on(arm: Arm, look: Look, memory: Memory) -> Script:
     middle, half = look.middle(source), look.middle(source) - look.low(source)
     place = look.middle(target)
     place[2] = look.high(target)[2] + half[2] + _GAP
-    grasp = _choose(arm, look, memory, source, place - middle)
-    if grasp is None:
+    taken = yield from _take(arm, look, memory, source, place - middle)
+    if taken is None:
         return
-    look = yield _pick(arm, look, source, grasp)
-    if not _held(look, source, middle, grasp, memory):
-        return
-    here, turn = arm.tool(look.qpos, look.base)
-    place[2] += look.middle(source)[2] - look.low(source)[2] - half[2]
-    there = here + place - look.middle(source)
-    over = np.array([*there[:2], max(here[2], there[2] + _ABOVE / 2)])
-    look = yield [*through([over, there], turn, 1.0), *_open(there, turn)]
-    yield through([over], turn, 0.0)
+    here, turn = arm.tool(taken.qpos, taken.base)
+    place[2] += taken.middle(source)[2] - taken.low(source)[2] - half[2]
+    there = here + place - taken.middle(source)
+    yield from _set_down(np.array([*there[:2], max(here[2], there[2] + _ABOVE / 2)]), there, turn)
 
 
 def lift(arm: Arm, look: Look, memory: Memory) -> Script:
     """Lift the source off everything: ``("lifted", source)``."""
     _, source = look.snapshot.goal[0]
-    middle = look.middle(source)
-    grasp = _choose(arm, look, memory, source, np.array([0, 0, _CARRIED]))
-    if grasp is None:
+    taken = yield from _take(arm, look, memory, source, np.array([0, 0, _CARRIED]))
+    if taken is None:
         return
-    look = yield _pick(arm, look, source, grasp)
-    if not _held(look, source, middle, grasp, memory):
-        return
-    here, turn = arm.tool(look.qpos, look.base)
+    here, turn = arm.tool(taken.qpos, taken.base)
     yield [*through([here + [0, 0, _CARRIED]], turn, 1.0), Waypoint(pose(here, turn), 1.0, hold=5)]
 
 
 def move_near(arm: Arm, look: Look, memory: Memory) -> Script:
     """Carry the source towards the target until it is near: ``("near", source, target)``."""
     _, source, target = look.snapshot.goal[0]
-    middle = look.middle(source)
-    grasp = _choose(arm, look, memory, source, _beside(look, source, target))
-    if grasp is None:
+    taken = yield from _take(arm, look, memory, source, _beside(look, source, target))
+    if taken is None:
         return
-    look = yield _pick(arm, look, source, grasp)
-    if not _held(look, source, middle, grasp, memory):
-        return
-    here, turn = arm.tool(look.qpos, look.base)
-    way = _beside(look, source, target)
-    over, there = here + [*way[:2], 0.0], here + way + [0, 0, middle[2] - look.middle(source)[2] + _GAP]
-    look = yield [*through([over, there], turn, 1.0), *_open(there, turn)]
-    yield through([over], turn, 0.0)
+    here, turn = arm.tool(taken.qpos, taken.base)
+    way = _beside(taken, source, target)
+    down = [0, 0, look.middle(source)[2] - taken.middle(source)[2] + _GAP]
+    yield from _set_down(here + [*way[:2], 0.0], here + way + down, turn)
 
 
 def _beside(look: Look, source: str, target: str) -> np.ndarray:
@@ -168,14 +156,12 @@ def put_in(arm: Arm, look: Look, memory: Memory) -> Script:
     if grasp is None or grasp.cost > _DOUBTFUL:
         yield _sweep(arm, look, source, place)
         return
-    look = yield _pick(arm, look, source, grasp)
-    if not _held(look, source, middle, grasp, memory):
+    taken = yield from _hold(arm, look, memory, source, grasp)
+    if taken is None:
         return
-    here, turn = arm.tool(look.qpos, look.base)
-    there = here + place - look.middle(source)
-    over = np.array([*there[:2], here[2]])
-    look = yield [*through([over, there], turn, 1.0), *_open(there, turn)]
-    yield through([over], turn, 0.0)
+    here, turn = arm.tool(taken.qpos, taken.base)
+    there = here + place - taken.middle(source)
+    yield from _set_down(np.array([*there[:2], here[2]]), there, turn)
 
 
 def _sweep(arm: Arm, look: Look, name: str, place: np.ndarray) -> list[Waypoint]:
@@ -193,6 +179,21 @@ def _sweep(arm: Arm, look: Look, name: str, place: np.ndarray) -> list[Waypoint]
     room, _ = arm.rehearse(look.qpos, look.base, ways, np.repeat(turns[:, None], len(stops), axis=1))
     best = int(np.argmax(np.minimum(room, _ROOM_ENOUGH) - _PREFER_UPRIGHT * np.tile(tilts, 2)))
     return through(stops, turns[best], 1.0)
+
+
+def _take(arm: Arm, look: Look, memory: Memory, name: str, way: np.ndarray) -> Taking:
+    """Take hold of a thing that is then to be moved by ``way`` [3], and lift it; None when that does not work."""
+    grasp = _choose(arm, look, memory, name, way)
+    return None if grasp is None else (yield from _hold(arm, look, memory, name, grasp))
+
+
+def _hold(arm: Arm, look: Look, memory: Memory, name: str, grasp: Grasp) -> Taking:
+    """``_take`` with a grasp; one that does not hold is remembered."""
+    lifted = yield _pick(arm, look, name, grasp)
+    if lifted.middle(name)[2] - look.middle(name)[2] > _FOLLOWED * _CARRIED:
+        return lifted
+    memory.failed.append(grasp)
+    return None
 
 
 def _choose(arm: Arm, look: Look, memory: Memory, name: str, carried: np.ndarray) -> Grasp | None:
@@ -230,16 +231,11 @@ def _pick(arm: Arm, look: Look, name: str, grasp: Grasp) -> list[Waypoint]:
     ]
 
 
-def _open(there: np.ndarray, turn: np.ndarray) -> list[Waypoint]:
-    return [Waypoint(pose(there, turn), 1.0, hold=1), Waypoint(pose(there, turn), 0.0, hold=3)]
-
-
-def _held(look: Look, name: str, before: np.ndarray, grasp: Grasp, memory: Memory) -> bool:
-    """Whether a thing has come along; a grasp that did not hold is remembered."""
-    held = look.middle(name)[2] - before[2] > _FOLLOWED * _CARRIED
-    if not held:
-        memory.failed.append(grasp)
-    return held
+def _set_down(over: np.ndarray, there: np.ndarray, turn: np.ndarray) -> Script:
+    """Go there [3] from above, open, rise again."""
+    at = pose(there, turn)
+    yield [*through([over, there], turn, 1.0), Waypoint(at, 1.0, hold=1), Waypoint(at, 0.0, hold=3)]
+    yield through([over], turn, 0.0)
 
 
 SCRIPTS: dict[str, Callable[[Arm, Look, Memory], Script]] = {
