@@ -279,6 +279,43 @@ def test_every_task_is_drawn_on_its_photograph(small: Path, suite: str) -> None:
     env.close()
 
 
+def test_a_driver_missing_in_workers_is_named_and_physics_goes_on(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vecenv.simpler.overlay import RendererMissing
+
+    for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        monkeypatch.setenv(name, str(small / "no_such_driver.json"))
+    env = make(BRIDGE, task=CARROT, episodes=range(2), assets=small, num_workers=2)
+    env.reset()
+    for _ in range(2):
+        with pytest.raises(RendererMissing, match="mesa-vulkan-drivers"):
+            _ = env.observe_egocentric().rgb
+        assert env.step_continuous(np.zeros((2, 7))).info["fault"] == ("", "")
+    env.close()
+
+
+@pytest.mark.heavy
+def test_worker_processes_draw_what_one_process_draws(small: Path) -> None:
+    if not drawable():
+        pytest.skip("no Vulkan driver")
+    pictures = []
+    for count in (1, 2):
+        env = make(BRIDGE, task=CARROT, episodes=range(3), assets=small, num_workers=count)
+        env.reset()
+        env._fault[1] = "bad"
+        before = env.observe_egocentric()
+        env.step_continuous(np.tile([0.05, 0, 0, 0, 0, 0, 1.0], (3, 1)))
+        # Drawn when read, of the moment of the observation; the arrays stay when others are drawn, and after close.
+        after = env.observe_egocentric()
+        pictures.append([after.rgb, before.rgb, before.depth, before.segmentation])
+        env.close()
+    (after, before, depth, shown), others = pictures
+    for one, other in zip(pictures[0], others, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (after[0] != before[0]).any()
+    assert not any(array[1].any() for array in (before, shown, depth))
+    assert depth[[0, 2]].max() > 0.3
+
+
 @pytest.mark.heavy
 def test_pixels_lead_back_to_the_object(small: Path) -> None:
     if not drawable():

@@ -15,7 +15,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -43,7 +43,7 @@ from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
 if TYPE_CHECKING:
-    from vecenv.simpler.overlay import Painter, Picture
+    from vecenv.simpler.overlay import Pictures
 
 BACKENDS = ("physx_cpu",)
 # What ``vecenv.make`` calls a suite's own CPU physics.
@@ -53,6 +53,8 @@ _NO_CUDA = (
     "spread over processes by num_threads. SAPIEN's GPU physics needs a PhysX library that is no part of its wheel, "
     "and vecenv's scenes, controllers and criteria have not been written or tested for it; a GPU does draw the pictures"
 )
+# Slot -> its episode and a row of facts.
+_Shown: TypeAlias = dict[int, tuple[Episode, np.void]]
 GRIPPERS = ("native", "binary")
 OVERLAYS = ("background", "none", "blend")
 # Largest action: metres, radians, gripper.
@@ -140,7 +142,6 @@ class SimplerEnv(SlotBatch):
         self._settled: dict[tuple[int, int], np.ndarray] = {}
         self._prepared: dict[tuple[int, int], Episode] = {}
         self._chains: dict[str, kinematics.Chain] = {}
-        self._painter: Painter | None = None
         self._place(placement)
 
     def _sizes(self) -> Sizes:
@@ -215,9 +216,7 @@ class SimplerEnv(SlotBatch):
         """Release physics and its processes; the environment cannot be used afterwards. Closing twice is harmless."""
         if self._slots is not None:
             self._slots.close()
-        if self._painter is not None:
-            self._painter.close()
-        self._slots = self._painter = None
+        self._slots = None
         self._closed = True
 
     # -- stepping ------------------------------------------------------------------------------------------------------
@@ -303,22 +302,25 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         facts = self._facts.copy()
         state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
-        seen = _Seen(self._paint, tuple(self._episodes), facts, tuple(self._fault))
+        healthy = [slot for slot, fault in enumerate(self._fault) if not fault]
+        seen = _Seen(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
         return SimplerEgocentric(
             state=state.astype(np.float32),
-            images=Rendered([_CAMERA], lambda _: {_CAMERA: seen.stacked("rgb")}),
-            depths=Rendered([_CAMERA], lambda _: {_CAMERA: seen.stacked("depth")}),
-            segmentations=Rendered([_CAMERA], lambda _: {_CAMERA: seen.stacked("segmentation")}),
+            images=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("rgb")}),
+            depths=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("depth")}),
+            segmentations=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("segmentation")}),
             views={_CAMERA: self._view(facts)},
             instances=tuple(instances(episode.spec) for episode in self._episodes),
         )
 
-    def _paint(self, episode: Episode, facts: np.void, depth: bool) -> Picture:
-        from vecenv.simpler.overlay import Painter
+    def _draw(self, shown: _Shown, deep: bool) -> Pictures:
+        from vecenv.simpler.overlay import Canvas, Style, Subject
 
-        if self._painter is None:
-            self._painter = Painter(self._root, self.config.overlay, self.config.shadows)
-        return self._painter.paint(episode, facts, depth)
+        camera = self._episodes[0].task.camera
+        style = Style(overlay=self.config.overlay, shadows=self.config.shadows)
+        canvas = Canvas(slots=self.num_envs, height=camera.height, width=camera.width, deep=deep)
+        orders = {slot: (Subject.of(episode, self._root), facts) for slot, (episode, facts) in shown.items()}
+        return self.slots.draw(style, canvas, orders)
 
     def _view(self, facts: np.ndarray) -> CameraView:
         cameras = [episode.task.camera for episode in self._episodes]
@@ -453,31 +455,15 @@ class SimplerEgocentric(Egocentric):
 class _Seen:
     """Pictures of all slots at one moment, drawn when the first of them is asked for; again when depth is missing."""
 
-    def __init__(
-        self,
-        paint: Callable[[Episode, np.void, bool], Picture],
-        episodes: tuple[Episode, ...],
-        facts: np.ndarray,
-        faults: tuple[str, ...],
-    ) -> None:
-        self._paint, self._episodes, self._facts, self._faults = paint, episodes, facts, faults
-        self._pictures: list[Picture | None] | None = None
-        self._deep = False
+    def __init__(self, draw: Callable[[_Shown, bool], Pictures], shown: _Shown) -> None:
+        self._draw, self._shown = draw, shown
+        self._pictures: Pictures | None = None
 
-    def stacked(self, field: str) -> np.ndarray:
-        """One field of the pictures, stacked; zeros where there is none."""
-        deep = field == "depth"
-        if self._pictures is None or (deep and not self._deep):
-            rows = zip(self._episodes, self._facts, self._faults, strict=True)
-            self._pictures = [None if fault else self._paint(episode, row, deep) for episode, row, fault in rows]
-            self._deep = deep
-        kinds = {"rgb": ((3,), np.uint8), "depth": ((), np.float32), "segmentation": ((), np.int16)}
-        camera, (tail, dtype) = self._episodes[0].task.camera, kinds[field]
-        out = np.zeros((len(self._pictures), camera.height, camera.width, *tail), dtype)
-        for slot, picture in enumerate(self._pictures):
-            if picture is not None:
-                out[slot] = getattr(picture, field)
-        return out
+    def of(self, field: str) -> np.ndarray:
+        """One field of the pictures; zeros where nothing was drawn."""
+        if self._pictures is None or getattr(self._pictures, field) is None:
+            self._pictures = self._draw(self._shown, field == "depth")
+        return getattr(self._pictures, field)
 
 
 class _Followed:

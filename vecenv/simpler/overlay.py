@@ -1,6 +1,7 @@
 """SIMPLER's pictures: the scene drawn by SAPIEN, and the real photograph that replaces its background.
 
-In: an ``Episode`` and a row of facts. Out: ``Picture``: colours as policies see them, depth, and what each pixel shows.
+In: what there is to see of an episode, and a row of facts. Out, in arrays of the caller: colours as policies see them,
+depth, and what each pixel shows.
 A ``Painter`` keeps *twins*: scenes with everything that is drawn, which are never stepped but posed like the slot they
 are to show. So physics itself needs no renderer, and slots that look alike share one twin. Drawing needs a Vulkan
 driver: a GPU's, or Mesa's lavapipe on a CPU (Mesa 24.3 or later).
@@ -17,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sapien
@@ -25,7 +26,7 @@ from PIL import Image
 
 from vecenv.simpler.episodes import Episode
 from vecenv.simpler.scenes import CABINET, ROBOT, Scene, SceneSpec, instances
-from vecenv.simpler.tasks import Camera, Lighting, SimplerTask
+from vecenv.simpler.tasks import Camera, Lighting
 
 # What upstream gives robots and, in one task, objects.
 _SHINY = {"specular": 0.9, "roughness": 0.3}
@@ -40,22 +41,50 @@ class RendererMissing(RuntimeError):
     """There is no usable Vulkan driver; the message says what to install."""
 
 
-@dataclass(frozen=True)
-class Picture:
-    """What a camera sees.
+class Pictures(NamedTuple):
+    """What cameras see; arrays to be filled or that were.
 
     Attributes:
-        rgb: colours, uint8 [H, W, 3].
-        depth: distance from the camera's plane, metres, float32 [H, W]; of the drawn scene, the photograph has none.
-            None where it was not asked for.
-        segmentation: index into ``instances``, int16 [H, W]; 0 is everything that the photograph replaces.
-        instances: names; the first is "".
+        rgb: colours, uint8 [..., H, W, 3].
+        segmentation: index into ``scenes.instances`` of the episode's scene, int16 [..., H, W]; 0 is everything that
+            the photograph replaces.
+        depth: distance from the camera's plane, metres, float32 [..., H, W]; of the drawn scene, the photograph has
+            none. None where it was not asked for.
     """
 
     rgb: np.ndarray
-    depth: np.ndarray | None
     segmentation: np.ndarray
-    instances: tuple[str, ...]
+    depth: np.ndarray | None
+
+    def of(self, slot: int) -> Pictures:
+        """Those of one slot, views."""
+        depth = None if self.depth is None else self.depth[slot]
+        return Pictures(self.rgb[slot], self.segmentation[slot], depth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Canvas:
+    """Room for pictures of B slots, with depth if ``deep``."""
+
+    slots: int
+    height: int
+    width: int
+    deep: bool
+
+    @property
+    def bytes(self) -> int:
+        """That it takes."""
+        return self.slots * self.height * self.width * (9 if self.deep else 5)
+
+    def pictures(self, memory: Any) -> Pictures:
+        """Arrays with B rows over a buffer."""
+        shape, count = (self.slots, self.height, self.width), self.slots * self.height * self.width
+        begin = 4 * count if self.deep else 0
+        return Pictures(
+            depth=np.frombuffer(memory, np.float32, count).reshape(shape) if self.deep else None,
+            segmentation=np.frombuffer(memory, np.int16, count, begin).reshape(shape),
+            rgb=np.frombuffer(memory, np.uint8, 3 * count, begin + 2 * count).reshape(*shape, 3),
+        )
 
 
 class _Minimal:
@@ -76,11 +105,12 @@ class _Minimal:
         for name, kind in self._FORMATS.items():
             sapien.render.set_picture_format(name, kind)
 
-    def read(self, camera: Any, depth: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Colours uint8 [H, W, 3], entities [H, W], and depth in metres or None."""
+    def read(self, camera: Any, depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Colours uint8 [H, W, 4] and entities int16 [H, W]; fills ``depth`` [H, W] with metres."""
         both = camera.get_picture("PositionSegmentation")
-        distance = both[..., 2].astype(np.float32) / -1000 if depth else None
-        return camera.get_picture("Color")[..., :3], both[..., 3], distance
+        if depth is not None:
+            np.divide(both[..., 2], -1000, out=depth, dtype=np.float32)
+        return camera.get_picture("Color"), both[..., 3]
 
 
 class _Default:
@@ -91,55 +121,102 @@ class _Default:
         sapien.render.set_camera_shader_dir("default")
         sapien.render.set_picture_format("Color", "r32g32b32a32sfloat")
 
-    def read(self, camera: Any, depth: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Colours uint8 [H, W, 3], entities [H, W], and depth in metres or None."""
+    def read(self, camera: Any, depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Colours uint8 [H, W, 3] and entities [H, W]; fills ``depth`` [H, W] with metres."""
+        if depth is not None:
+            np.negative(camera.get_picture("Position")[..., 2], out=depth)
         colour = (np.clip(camera.get_picture("Color")[..., :3], 0.0, 1.0) * 255).astype(np.uint8)
-        distance = -camera.get_picture("Position")[..., 2] if depth else None
-        return colour, camera.get_picture("Segmentation")[..., 1], distance
+        return colour, camera.get_picture("Segmentation")[..., 1]
 
 
 MINIMAL, DEFAULT = _Minimal(), _Default()
 
 
-class Painter:
-    """Draws episodes.
+@dataclass(frozen=True, kw_only=True)
+class Style:
+    """How episodes are drawn.
 
-    Args:
-        root: of the asset tree.
+    Attributes:
         overlay: ``"background"``, upstream's visual matching; ``"none"``, the drawn scene; or ``"blend"``, both at one
             half, to see how well they match.
         shadows: lights that can cast shadows do; upstream leaves them off.
     """
 
-    def __init__(self, root: Path, overlay: str = "background", shadows: bool = False) -> None:
-        self._root, self._overlay, self._shadows = root, overlay, shadows
+    overlay: str = "background"
+    shadows: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """What is to be seen of an episode.
+
+    Attributes:
+        spec: its scene, with the robot's own colours.
+        camera, lighting: of the task.
+        shiny, matte: what upstream does to the robot's and to objects' materials.
+        hidden: objects that the photograph replaces.
+        photo: file of the photograph.
+    """
+
+    spec: SceneSpec
+    camera: Camera
+    lighting: Lighting
+    shiny: bool
+    matte: bool
+    hidden: frozenset[str]
+    photo: Path
+
+    @classmethod
+    def of(cls, episode: Episode, root: Path) -> Subject:
+        """Of an episode; ``root`` is that of the asset tree."""
+        task, layout = episode.task, episode.layout
+        urdf = root / task.robot.urdf_path(layout.urdf_version)
+        return cls(
+            spec=replace(episode.spec, robot=replace(episode.spec.robot, urdf=urdf)),
+            camera=task.camera,
+            lighting=task.lighting,
+            shiny=task.shiny,
+            matte=task.matte,
+            hidden=frozenset(task.always_overlaid),
+            photo=root / layout.overlay,
+        )
+
+
+class Painter:
+    """Draws episodes in a style."""
+
+    def __init__(self, style: Style) -> None:
+        self.style = style
         self._twins: OrderedDict[Any, _Twin] = OrderedDict()
 
-    def paint(self, episode: Episode, facts: np.void, depth: bool = False) -> Picture:
-        """The third-person camera's picture of an episode in the state that the facts describe.
+    def paint(self, subject: Subject, facts: np.void, out: Pictures) -> None:
+        """The third-person camera's picture of a subject in the state that the facts describe.
 
         Args:
-            episode: what is to be seen.
+            subject: what is to be seen.
             facts: how it stands.
-            depth: whether to fetch the depth too.
+            out: where the picture goes.
 
         Raises:
             RendererMissing: no Vulkan driver.
         """
-        drawn = self._twin(episode).draw(facts, episode, depth)
-        if self._overlay == "none":
-            return drawn
-        photo = _photo(self._root / episode.layout.overlay, drawn.rgb.shape[1], drawn.rgb.shape[0])
-        if self._overlay == "blend":
-            return replace(drawn, rgb=(drawn.rgb // 2 + photo // 2))
-        return replace(drawn, rgb=np.where(drawn.segmentation[..., None] > 0, drawn.rgb, photo))
+        colours = self._twin(subject).draw(facts, subject.hidden, out)
+        if self.style.overlay == "none":
+            out.rgb[:] = colours[..., :3]
+            return
+        height, width = out.segmentation.shape
+        photo = _photo(subject.photo, width, height)
+        if self.style.overlay == "blend":
+            np.add(colours[..., :3] // 2, photo // 2, out=out.rgb)
+            return
+        out.rgb[:] = photo
+        shown = np.flatnonzero(out.segmentation)
+        out.rgb.reshape(-1, 3)[shown] = colours.reshape(-1, colours.shape[-1])[shown, :3]
 
-    def _twin(self, episode: Episode) -> _Twin:
-        urdf = self._root / episode.task.robot.urdf_path(episode.layout.urdf_version)
-        spec = replace(episode.spec, robot=replace(episode.spec.robot, urdf=urdf))
-        key = (spec, episode.task.camera, episode.task.lighting, episode.task.matte)
+    def _twin(self, subject: Subject) -> _Twin:
+        key = (subject.spec, subject.camera, subject.lighting, subject.matte)
         if key not in self._twins:
-            self._twins[key] = _Twin(spec, episode.task, self._shadows)
+            self._twins[key] = _Twin(subject, self.style.shadows)
             while len(self._twins) > _TWINS:
                 self._twins.popitem(last=False)
         self._twins.move_to_end(key)
@@ -153,16 +230,16 @@ class Painter:
 class _Twin:
     """A scene to be drawn."""
 
-    def __init__(self, spec: SceneSpec, task: SimplerTask, shadows: bool) -> None:
+    def __init__(self, subject: Subject, shadows: bool) -> None:
         check_renderer()
-        self._scene = Scene(spec, visuals=True)
-        self._names = instances(spec)
-        _light(self._scene.sapien, task.lighting, shadows)
-        if spec.stage is None:
+        self._scene = Scene(subject.spec, visuals=True)
+        self._names = instances(subject.spec)
+        _light(self._scene.sapien, subject.lighting, shadows)
+        if subject.spec.stage is None:
             self._draw_floor()
         self._shader = DEFAULT if shadows else MINIMAL
-        self._camera = self._mount(task.camera)
-        self._paint_surfaces(task)
+        self._camera = self._mount(subject.camera)
+        self._paint_surfaces(subject)
 
     def _draw_floor(self) -> None:
         builder = self._scene.sapien.create_actor_builder()
@@ -178,28 +255,29 @@ class _Twin:
         made.set_local_pose(frame.local * sapien.Pose(list(camera.position), list(camera.quat)))
         return made
 
-    def _paint_surfaces(self, task: SimplerTask) -> None:
-        if task.shiny:
+    def _paint_surfaces(self, subject: Subject) -> None:
+        if subject.shiny:
             for link in self._scene.robot.physx.links:
                 _give(link.entity, _SHINY)
         for thing in self._scene.objects:
-            if task.matte:
+            if subject.matte:
                 _give(thing, _MATTE)
             _let_shine(thing)
 
-    def draw(self, facts: np.void, episode: Episode, depth: bool) -> Picture:
+    def draw(self, facts: np.void, hidden: frozenset[str], out: Pictures) -> np.ndarray:
+        """Fill segmentation and depth; returns the colours, uint8 [H, W, 3 or 4]."""
         scene = self._scene
         scene.show(facts)
         scene.sapien.update_render()
         self._camera.take_picture()
-        colour, shown, distance = self._shader.read(self._camera, depth)
-        return Picture(rgb=colour, depth=distance, segmentation=self._numbers(episode)[shown], instances=self._names)
+        colour, shown = self._shader.read(self._camera, out.depth)
+        np.take(self._numbers(hidden), shown, out=out.segmentation, mode="clip")
+        return colour
 
-    def _numbers(self, episode: Episode) -> np.ndarray:
+    def _numbers(self, hidden: frozenset[str]) -> np.ndarray:
         """SAPIEN's number of an entity -> index into the names."""
         scene = self._scene
         kept = [(link.entity, ROBOT) for link in scene.robot.physx.links]
-        hidden = episode.task.always_overlaid
         kept += [(thing, thing.name) for thing in scene.objects if thing.name not in hidden]
         if scene.cabinet is not None:
             kept += [(link.entity, CABINET) for link in scene.cabinet.physx.links]

@@ -1,9 +1,10 @@
 """Many slots: scenes side by side in this process, or spread over worker processes.
 
 In: which scene and start a slot gets, and set-points of all slots, [B, substeps, dof]. Out: ``facts``, one row of
-``scenes.facts_dtype`` a slot, and ``faults``. A PhysX step in SAPIEN holds Python's lock, so threads would not help:
-several processes are what uses several cores. Set-points and facts lie in memory that all of them share; what is sent
-is a few bytes a tick. Workers are started as a module, so the caller's script is not imported again.
+``scenes.facts_dtype`` a slot, and ``faults``; and pictures. A PhysX step in SAPIEN holds Python's lock, so threads
+would not help: several processes are what uses several cores. Set-points and facts lie in memory that all of them
+share; what is sent is a few bytes a tick. Pictures are drawn where their slots are, into memory that is made for them.
+Workers are started as a module, so the caller's script is not imported again.
 """
 
 from __future__ import annotations
@@ -14,14 +15,21 @@ import socket
 import subprocess
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from multiprocessing import reduction
 from multiprocessing.connection import Connection
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
 from vecenv.simpler.scenes import Scene, SceneSpec, Start, facts_dtype
+
+if TYPE_CHECKING:
+    from vecenv.simpler.overlay import Canvas, Painter, Pictures, Style, Subject
+
+# What is to be seen in each slot, and a row of facts.
+Orders: TypeAlias = "Mapping[int, tuple[Subject, np.void]]"
 
 # Scenes that no slot uses at present, kept for when one is wanted again.
 _SPARE = 8
@@ -77,6 +85,14 @@ class Slots(Protocol):
         """One control tick of the slots in ``active`` (bool [B]); ``facts`` and ``faults`` then hold what came out."""
         ...
 
+    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+        """Pictures of the slots in ``orders``, each of a subject in a state (a row of facts); the others are 0.
+
+        Raises:
+            RendererMissing: no Vulkan driver.
+        """
+        ...
+
     def state(self) -> list[np.ndarray]:
         """Physics state of every slot."""
         ...
@@ -103,6 +119,7 @@ class LocalSlots:
         self.faults = [""] * sizes.slots
         self._scenes: dict[int, Scene] = {}
         self._spare: list[Scene] = []
+        self._painter: Painter | None = None
 
     def begin(self, jobs: Sequence[Job]) -> dict[int, np.ndarray]:
         """See ``Slots``."""
@@ -139,6 +156,21 @@ class LocalSlots:
         active[list(slots)] = True
         self.run(active, self._position, self._velocity)
 
+    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+        """See ``Slots``."""
+        return self.draw_into(mmap.mmap(-1, canvas.bytes), style, canvas, orders)
+
+    def draw_into(self, memory: mmap.mmap, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+        """``draw`` over a buffer."""
+        from vecenv.simpler.overlay import Painter
+
+        if self._painter is None or self._painter.style != style:
+            self._painter = Painter(style)
+        pictures = canvas.pictures(memory)
+        for slot, (subject, facts) in orders.items():
+            self._painter.paint(subject, facts, pictures.of(slot))
+        return pictures
+
     def state(self) -> list[np.ndarray]:
         """See ``Slots``."""
         return [scene.state() for _, scene in sorted(self._scenes.items())]
@@ -153,6 +185,8 @@ class LocalSlots:
         """See ``Slots``."""
         self._scenes.clear()
         self._spare.clear()
+        if self._painter is not None:
+            self._painter.close()
 
 
 class ProcessSlots:
@@ -169,7 +203,8 @@ class ProcessSlots:
         self._memory = mmap.mmap(self._handle, sizes.bytes)
         self.facts, self._position, self._velocity = sizes.arrays(self._memory)
         self.faults = [""] * sizes.slots
-        self._workers = [_Worker(sizes, self._handle) for _ in range(min(workers, sizes.slots))]
+        count = min(workers, sizes.slots)
+        self._workers = [_Worker(sizes, self._handle, _environment(count)) for _ in range(count)]
 
     def _owner(self, slot: int) -> int:
         return slot % len(self._workers)
@@ -180,11 +215,17 @@ class ProcessSlots:
             shares.setdefault(self._owner(int(slot)), []).append(int(slot))
         return shares
 
-    def _ask(self, asked: dict[int, tuple[str, Any]]) -> dict[int, Any]:
-        """Send every worker its request, then collect every answer."""
+    def _ask(self, asked: dict[int, tuple[str, Any]], handle: int | None = None) -> dict[int, Any]:
+        """Send every worker its request, and a file handle if there is one; then collect every answer."""
         for index, request in asked.items():
-            self._workers[index].send(request)
-        answers = {index: self._workers[index].receive() for index in asked}
+            self._workers[index].send(request, handle)
+        received = {index: self._workers[index].receive() for index in asked}
+        failed = [answer for worked, answer in received.values() if not worked]
+        if failed:
+            raise (
+                failed[0] if isinstance(failed[0], Exception) else WorkerError(f"a SIMPLER worker failed:\n{failed[0]}")
+            )
+        answers = {index: answer for index, (_, answer) in received.items()}
         for index in asked:
             faults, answers[index] = answers[index]
             for slot, fault in faults.items():
@@ -203,6 +244,21 @@ class ProcessSlots:
         self._position[active], self._velocity[active] = position[active], velocity[active]
         shares = self._share(np.flatnonzero(active).tolist())
         self._ask({i: ("run", slots) for i, slots in shares.items()})
+
+    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+        """See ``Slots``."""
+        handle = os.memfd_create("vecenv-simpler-pictures")
+        try:
+            os.ftruncate(handle, canvas.bytes)
+            memory = mmap.mmap(handle, canvas.bytes)
+            shares = self._share(list(orders))
+            asked = {
+                i: ("draw", (style, canvas, {slot: orders[slot] for slot in slots})) for i, slots in shares.items()
+            }
+            self._ask(asked, handle)
+        finally:
+            os.close(handle)
+        return canvas.pictures(memory)
 
     def state(self) -> list[np.ndarray]:
         """See ``Slots``."""
@@ -230,31 +286,31 @@ class ProcessSlots:
 class _Worker:
     """One process, and the pipe to it."""
 
-    def __init__(self, sizes: Sizes, memory: int) -> None:
+    def __init__(self, sizes: Sizes, memory: int, environment: dict[str, str]) -> None:
         mine, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "vecenv.simpler.workers", str(theirs.fileno()), str(memory)],
                 pass_fds=(theirs.fileno(), memory),
-                env=_single_threaded(),
+                env=environment,
             )
         self._pipe = Connection(mine.detach())
         self.send(sizes)
 
-    def send(self, message: Any) -> None:
+    def send(self, message: Any, handle: int | None = None) -> None:
         try:
             self._pipe.send(message)
+            if handle is not None:
+                reduction.send_handle(self._pipe, handle, self._process.pid)
         except OSError as error:
             raise self._gone() from error
 
-    def receive(self) -> Any:
+    def receive(self) -> tuple[bool, Any]:
+        """Whether it worked, and the answer or else what ``_sent`` made of the error."""
         try:
-            worked, answer = self._pipe.recv()
+            return self._pipe.recv()
         except (EOFError, OSError) as error:
             raise self._gone() from error
-        if not worked:
-            raise WorkerError(f"a SIMPLER worker failed:\n{answer}")
-        return answer
 
     def _gone(self) -> WorkerError:
         return WorkerError(f"a SIMPLER worker ended unexpectedly (exit status {self._process.poll()})")
@@ -268,10 +324,12 @@ class _Worker:
             self._process.wait()
 
 
-def _single_threaded() -> dict[str, str]:
-    """This process' environment, with the module search path of this process and one thread for numerics."""
+def _environment(workers: int) -> dict[str, str]:
+    """A worker's: the module search path of this process, one thread for numerics, its share of the cores for Mesa."""
     paths = [path for path in sys.path if path]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    cores = max(1, len(os.sched_getaffinity(0)) // workers)
+    own = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    return {"LP_NUM_THREADS": str(cores), **os.environ, **own}
 
 
 def make_slots(sizes: Sizes, workers: int) -> LocalSlots | ProcessSlots:
@@ -283,7 +341,13 @@ def _serve(pipe: Connection, memory: int) -> None:
     """A worker's life: requests until the pipe closes."""
     sizes: Sizes = pipe.recv()
     local = LocalSlots(sizes, mmap.mmap(memory, sizes.bytes))
-    calls = {"begin": local.begin, "run": local.run_shared, "state": lambda _: local.state(), "restore": local.restore}
+    calls = {
+        "begin": local.begin,
+        "run": local.run_shared,
+        "draw": lambda asked: _draw(local, pipe, *asked),
+        "state": lambda _: local.state(),
+        "restore": local.restore,
+    }
     known: dict[int, str] = {}
     while True:
         try:
@@ -292,12 +356,28 @@ def _serve(pipe: Connection, memory: int) -> None:
             return
         try:
             answer = calls[name](argument)
-        except Exception:
-            pipe.send((False, traceback.format_exc()))
+        except Exception as error:
+            pipe.send((False, _sent(error)))
             continue
         changed = {slot: fault for slot, fault in enumerate(local.faults) if known.get(slot, "") != fault}
         known.update(changed)
         pipe.send((True, (changed, answer)))
+
+
+def _draw(local: LocalSlots, pipe: Connection, style: Style, canvas: Canvas, orders: Orders) -> None:
+    """Draw into the memory whose handle follows the request."""
+    handle = reduction.recv_handle(pipe)
+    try:
+        local.draw_into(mmap.mmap(handle, canvas.bytes), style, canvas, orders)
+    finally:
+        os.close(handle)
+
+
+def _sent(error: Exception) -> Exception | str:
+    """What the caller gets of an error: its traceback, or itself when it says that there is no driver."""
+    from vecenv.simpler.overlay import RendererMissing
+
+    return error if isinstance(error, RendererMissing) else traceback.format_exc()
 
 
 if __name__ == "__main__":
