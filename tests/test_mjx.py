@@ -78,6 +78,20 @@ def test_a_chunk_ends_where_native_physics_ends(both: tuple[LiberoEnv, LiberoEnv
         np.testing.assert_array_equal(getattr(controls[0], name), getattr(controls[1], name))
 
 
+def test_images_show_the_moment_that_native_physics_shows(both: tuple[LiberoEnv, LiberoEnv]) -> None:
+    seen, now = [], []
+    for env in both:
+        (group,) = env.physics.groups
+        np.testing.assert_array_equal(group.seen_qpos, group.qpos)
+        env.step_continuous(chunk(4))
+        seen.append(group.seen_qpos.copy())
+        now.append(group.qpos.copy())
+    # The hand is on its way: the end of the tick, two substeps later, is elsewhere.
+    arm = np.s_[:, :7]
+    assert np.abs(now[1] - seen[1])[arm].max() > 3e-4
+    np.testing.assert_allclose(seen[0][arm], seen[1][arm], atol=3e-5)
+
+
 def test_a_chunk_is_the_same_as_its_ticks(warp: LiberoEnv) -> None:
     actions = chunk(3)
     warp.set_episodes(tasks=0, episodes=range(SLOTS))

@@ -78,6 +78,7 @@ class World(NamedTuple):
         eef_pos: end-effector position as robosuite's observables report it, metres, [3].
         eef_quat: hand orientation likewise, wxyz, [4].
         fingers: finger positions likewise, metres, [2].
+        seen_qpos: positions as camera images show them, those of ``eef_pos``, [nq].
         fault: bits of ``Fault``, 0 while healthy, int32.
     """
 
@@ -90,6 +91,7 @@ class World(NamedTuple):
     eef_pos: jax.Array
     eef_quat: jax.Array
     fingers: jax.Array
+    seen_qpos: jax.Array
     fault: jax.Array
 
 
@@ -282,6 +284,7 @@ def new_world(system: System, blank: mjx.Data) -> World:
         eef_pos=jnp.zeros(3, home.qpos.dtype),
         eef_quat=jnp.zeros(4, home.qpos.dtype),
         fingers=jnp.zeros(2, home.qpos.dtype),
+        seen_qpos=jnp.zeros_like(blank.qpos),
         fault=jnp.zeros((), jnp.int32),
     )
 
@@ -362,7 +365,7 @@ def observe(system: System, world: World) -> World:
     """The world with its proprioception taken from the present state."""
     robot = world.data.qpos[:_ROBOT]
     pos, quat = kinematics.hand_pose(system.chain, robot)
-    return world._replace(eef_pos=pos, eef_quat=quat, fingers=robot[7:])
+    return world._replace(eef_pos=pos, eef_quat=quat, fingers=robot[7:], seen_qpos=world.data.qpos)
 
 
 def control_step(system: System, world: World, action: jax.Array, active: Any = True) -> World:
@@ -386,7 +389,7 @@ def _control_step(system: System, world: World, action: jax.Array, active: jax.A
         data, fingers, fault = carry
         robot, speed = data.qpos[:_ROBOT], data.qvel[:_ROBOT]
         arm = kinematics.arm_state(system.chain, robot, speed)
-        seen = (*kinematics.hand_pose(system.chain, robot), robot[7:])
+        seen = (*kinematics.hand_pose(system.chain, robot), robot[7:], data.qpos)
         seen_by_controller = _as_remembered(system, arm, world.stale & (index == 0))
         torque = osc.torques(seen_by_controller, goal, system.home.qpos)
         fingers = gripper_control.integrate(fingers, action[6])
@@ -397,7 +400,7 @@ def _control_step(system: System, world: World, action: jax.Array, active: jax.A
     carry = (world.data, world.gripper, jnp.zeros((), jnp.int32))
     (data, fingers, fault), seen = lax.scan(advance, carry, jnp.arange(SUBSTEPS))
     data, fault = _sensed(system, data), fault | jnp.where(_stable(data), 0, _UNSTABLE)
-    pos, quat, finger_pos = seen
+    pos, quat, finger_pos, qpos = seen
     after = world._replace(
         goal=goal,
         gripper=fingers,
@@ -405,6 +408,7 @@ def _control_step(system: System, world: World, action: jax.Array, active: jax.A
         eef_pos=pos[OBSERVED_POSE],
         eef_quat=quat[OBSERVED_POSE],
         fingers=finger_pos[OBSERVED_FINGERS],
+        seen_qpos=qpos[OBSERVED_POSE],
         fault=world.fault | fault.astype(jnp.int32),
     )
     small = jax.tree.map(
@@ -750,8 +754,8 @@ class MjxGroup:
 
     @property
     def seen_qpos(self) -> np.ndarray:
-        """[n, nq]: the present ones; upstream's images are two substeps (4 ms) older."""
-        return self._fetch("qpos")
+        """[n, nq]: as camera images show them."""
+        return self.get(self.worlds.seen_qpos).astype(float)
 
     @property
     def qvel(self) -> np.ndarray:
