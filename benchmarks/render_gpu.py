@@ -2,8 +2,9 @@
 
 For every scene, image size and batch size, one compiled loop of control steps of the functional environment under
 random actions: physics alone, images alone (of the same worlds, moved a little each time), and both. The three take
-turns. Pictures are held against GL's of the same states where there are some: ``--references`` is a folder of
-``suite_task_size.npz`` with ``xpos``, ``xquat``, ``qpos``, ``rgb``, ``seg`` of N states.
+turns; nothing else may use the GPU meanwhile. Pictures are held against GL's of the same states where there are some:
+``--references`` is a folder of ``suite_task_size.npz`` with ``xpos``, ``xquat``, ``qpos``, ``rgb``, ``seg`` of N
+states.
 
 The GPU's machine needs neither GL nor LIBERO: ``--scenes`` is what ``vecenv compile`` wrote; ``--sceneries`` (a folder
 of ``suite_task.npz``) and references are made by ``--write`` on a machine that has both.
@@ -12,12 +13,9 @@ of ``suite_task.npz``) and references are made by ``--write`` on a machine that 
 from __future__ import annotations
 
 import argparse
-import fcntl
 import itertools
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +65,6 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--scenes", help="folder that `vecenv compile` wrote")
     parser.add_argument("--sceneries", type=Path, default=Path("sceneries"))
     parser.add_argument("--references", type=Path)
-    parser.add_argument("--turns", type=Path, help="a file: processes given the same one measure one after another")
     parser.add_argument("--pictures", type=Path, help="folder for pictures beside their references")
     parser.add_argument("--write", action="store_true", help="make sceneries and references, on a machine with GL")
     parser.add_argument("--name", default="render_gpu", help="name of the results file")
@@ -89,8 +86,7 @@ def measure(env: LiberoEnv, size: int, batch: int, options: argparse.Namespace) 
     start = time.perf_counter()
     first = [timed_first(run)[1] for run in (runs.physics, runs.images, runs.both)]
     ready = time.perf_counter() - start
-    with turn(options.turns):
-        rates = alternate([runs.physics, runs.images, runs.both], options.rounds, options.seconds)
+    rates = alternate([runs.physics, runs.images, runs.both], options.rounds, options.seconds)
     physics, images, both = (round(rate * batch * STEPS) for rate in rates)
     return {
         "scene": f"{env.suite}/{env.task}",
@@ -107,17 +103,6 @@ def measure(env: LiberoEnv, size: int, batch: int, options: argparse.Namespace) 
         "MiB on device": round(memory() / 2**20),
         **(quality(scenery, env.suite, env.task, size, options) if options.references else {}),
     }
-
-
-@contextmanager
-def turn(lock: Path | None) -> Iterator[None]:
-    """A time in which no other process that was given this file measures."""
-    if lock is None:
-        yield
-        return
-    with lock.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def memory() -> int:

@@ -9,6 +9,7 @@ when such a batch is first traced. On a CPU the same code runs, slowly.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -22,14 +23,15 @@ from mujoco.mjx.warp import render_context
 from vecenv.controllers.rotations import quat_to_mat
 from vecenv.libero.bddl import Problem
 from vecenv.physics.mapped import Sized
-from vecenv.render.drawing import Pose
+from vecenv.render.drawing import Pose, View
 from vecenv.render.gl import Frames, Shot, Wanted
-from vecenv.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, VisualOptions
-from vecenv.render.scenery import Scenery, installed_scenery
+from vecenv.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, UserCamera, VisualOptions
+from vecenv.render.raykernel import HEADLIGHT, make_kernel
+from vecenv.render.scenery import Scenery, drawn_colors, installed_scenery
 
-# Threads of a block on the GPU, and the tile of pixels, rows and columns, that 32 of them trace: rays that travel
-# together are faster. Measured on an H200, benchmarks/render_gpu.py.
-BLOCK, TILE = 32, (4, 8)
+# Threads of a block on the GPU, registers of a thread, and the tile of pixels, rows and columns, that threads next to
+# each other trace: rays that travel together are faster. Measured on an H200, benchmarks/render_gpu.py.
+BLOCK, REGISTERS, TILE = 128, 96, (8, 8)
 
 
 class Seen(NamedTuple):
@@ -46,18 +48,40 @@ class Seen(NamedTuple):
     segmentation: jax.Array | None
 
 
+class Style(NamedTuple):
+    """How one world with C cameras and a scenery of I instances is looked at, and how it looks; see ``plain_style``.
+
+    Attributes:
+        light: scale of red, green and blue light, [3].
+        lamps: moves all lamps, metres, world frame, [3].
+        colors: scale of red, green, blue of each of the scenery's ``instances``, [I, 3].
+        pos, turn: move each camera, metres [C, 3], and turn it [C, 3, 3], in its own frame (x right, y up, looking
+            along -z); those of a free camera are its pose in the world.
+        fovy: vertical field of view of each camera, degrees, [C].
+    """
+
+    light: Any
+    lamps: Any
+    colors: Any
+    pos: Any
+    turn: Any
+    fovy: Any
+
+
 class RayTracer:
     """The cameras of a scenery.
 
     Args:
         scenery: what there is to see.
         height, width: of the images, pixels.
-        cameras: which cameras, in the order of the images; ``"wrist"`` is another name of ``"robot0_eye_in_hand"``.
+        cameras: which cameras, in the order of the images; ``"wrist"`` is another name of ``"robot0_eye_in_hand"``, and
+            None is a free camera, which a ``Style`` puts somewhere.
         rgb, depth, segmentation: which images ``look`` makes.
         samples: rays a pixel along each side, averaged; GL takes four a pixel. Two cost four times as much.
         block_dim: threads of a block on the GPU.
-        tile: rows and columns of pixels that neighbouring threads trace; ``(1, 1)`` for row by row.
-        options: further options of ``mjx.create_render_context``.
+        tile: most rows and columns of pixels that neighbouring threads trace; ``(1, 1)`` for row by row.
+        registers: most registers of a thread on the GPU; 0 leaves it to the compiler.
+        culling: whether faces are seen from their front only, as GL shows them; without, images are 7 % faster.
 
     Raises:
         RenderError: the scenery has no such camera.
@@ -69,39 +93,55 @@ class RayTracer:
         *,
         height: int = 256,
         width: int = 256,
-        cameras: Sequence[str] = POLICY_CAMERAS,
+        cameras: Sequence[str | None] = POLICY_CAMERAS,
         rgb: bool = True,
         depth: bool = False,
         segmentation: bool = False,
         samples: int = 1,
         block_dim: int = BLOCK,
         tile: tuple[int, int] = TILE,
-        **options: Any,
+        registers: int = REGISTERS,
+        culling: bool = True,
     ) -> None:
         self.scenery, self.height, self.width, self.cameras = scenery, height, width, tuple(cameras)
         self._wanted = rgb, depth, segmentation
         self._model = model = scenery.model
-        self._camera_ids = [_camera(model, name) for name in cameras]
+        self._camera_ids = [0 if name is None else _camera(model, name) for name in cameras]
+        self._is_free = np.array([name is None for name in cameras])
         self._put = mjx.put_model(model, impl="warp")
         sizes = self._put._impl.block_dim.__class__(render=block_dim)
-        self._put = self._put.tree_replace({"_impl.block_dim": sizes})
-        self._tile = tile if height % tile[0] == 0 and width % tile[1] == 0 else (1, 1)
+        self._put = self._put.tree_replace({"_impl.block_dim": sizes}).replace(**_lamps(model))
+        self._tile = math.gcd(height, tile[0]), math.gcd(width, tile[1])
         self._blank = mjx.make_data(model, impl="warp", naconmax=1, njmax=1)
-        # Normals blended over a face are slower and, with simplified meshes, farther from GL.
-        fixed = {"samples_per_pixel": samples, "render_skybox": True, "enable_vertex_normals": False}
-        self._options = {**fixed, **options}
+        self._options = {"samples_per_pixel": samples, "enable_backface_culling": culling}
+        self._registers = registers
         self._contexts: dict[int, Any] = {}
         self._look = Sized(self._look_at, self._context)
 
-    def look(self, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array) -> Seen:
+    @property
+    def plain_style(self) -> Style:
+        """The style that changes nothing; a free camera is at the world's origin and looks down, with 45 degrees."""
+        count = len(self.cameras)
+        fovy = np.where(self._is_free, 45.0, self._model.cam_fovy[self._camera_ids])
+        return Style(
+            light=np.ones(3, np.float32),
+            lamps=np.zeros(3, np.float32),
+            colors=np.ones((len(self.scenery.instances), 3), np.float32),
+            pos=np.zeros((count, 3), np.float32),
+            turn=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
+            fovy=fovy.astype(np.float32),
+        )
+
+    def look(self, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array, style: Style | None = None) -> Seen:
         """What the cameras of one world see.
 
         Args:
             xpos: positions of the bodies of the physics model, world frame, metres, [nbody, 3].
             xquat: their orientations, wxyz, [nbody, 4].
             qpos: [nq], read for what glows while a joint is turned.
+            style: how it looks; None for ``plain_style``.
         """
-        return self._look(xpos, xquat, qpos)
+        return self._look(xpos, xquat, qpos) if style is None else self._look(xpos, xquat, qpos, style)
 
     def _context(self, num_worlds: int) -> Any:
         if num_worlds not in self._contexts:
@@ -118,7 +158,9 @@ class RayTracer:
                     enabled_geom_groups=[1],
                     **self._options,
                 )
-                self._tile_rays(render_context.get(context.pytree()))
+                rays = render_context.get(context.pytree())
+                self._tile_rays(rays)
+                rays._megakernel = make_kernel(self._model, rays, self._registers)
                 self._contexts[num_worlds] = context
         return self._contexts[num_worlds].pytree()
 
@@ -134,17 +176,25 @@ class RayTracer:
         tiles = buffer.reshape(-1, self.height // rows, self.width // columns, rows, columns, *rest)
         return tiles.swapaxes(2, 3).reshape(-1, self.height, self.width, *rest)[:, :, ::-1]
 
-    def _look_at(self, context: Any, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array) -> Seen:
-        model = self._put.replace(geom_rgba=self._colors(qpos))
-        data = mjx.refit_bvh(model, self._posed(xpos, xquat), context)
+    def _look_at(
+        self, context: Any, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array, style: Style | None = None
+    ) -> Seen:
+        style = self.plain_style if style is None else style
+        model = self._put.replace(geom_rgba=self._colors(qpos, style), cam_fovy=self._widths(style))
+        model = model.replace(
+            light_ambient=self._put.light_ambient * style.light,
+            light_diffuse=self._put.light_diffuse * style.light,
+            light_specular=self._put.light_specular * style.light,
+        )
+        data = mjx.refit_bvh(model, self._posed(xpos, xquat, style), context)
         if self._wanted[2]:
             rgb, depth, segmentation, _ = mjx.render_with_segmentation(model, data, context)
             return self._delivered(rgb, depth, segmentation)
         rgb, depth, _ = mjx.render(model, data, context)
         return self._delivered(rgb, depth, None)
 
-    def _posed(self, xpos: jax.Array, xquat: jax.Array) -> mjx.Data:
-        model = self._model
+    def _posed(self, xpos: jax.Array, xquat: jax.Array, style: Style) -> mjx.Data:
+        model, chosen = self._model, self._camera_ids
         mats = jax.vmap(quat_to_mat)(xquat.astype(jnp.float32))
         xpos = xpos.astype(jnp.float32)
 
@@ -154,23 +204,34 @@ class RayTracer:
                 turn, jnp.asarray(own, jnp.float32)
             )
 
+        free = self._is_free[:, None]
+        bodies = np.where(self._is_free, 0, model.cam_bodyid[chosen])
+        own_pos = np.where(free, 0.0, model.cam_pos[chosen])
+        own_mat = np.where(free[..., None], np.eye(3), _matrices(model.cam_quat[chosen]))
         geom_xpos, geom_xmat = place(model.geom_bodyid, model.geom_pos, _matrices(model.geom_quat))
-        cam_xpos, cam_xmat = place(model.cam_bodyid, model.cam_pos, _matrices(model.cam_quat))
+        cam_xpos, cam_xmat = place(bodies, own_pos, own_mat)
         light_xpos, light_xdir = place(model.light_bodyid, model.light_pos, model.light_dir[..., None])
+        spare = jnp.zeros((self._put.light_type.shape[0] - model.nlight, 3))
         return self._blank.tree_replace(
             {
                 "geom_xpos": geom_xpos,
                 "geom_xmat": geom_xmat,
-                "cam_xpos": cam_xpos,
-                "cam_xmat": cam_xmat,
-                "_impl.light_xpos": light_xpos,
-                "_impl.light_xdir": light_xdir[..., 0],
+                "cam_xpos": cam_xpos + _times(cam_xmat, jnp.asarray(style.pos)[..., None])[..., 0],
+                "cam_xmat": _times(cam_xmat, jnp.asarray(style.turn)),
+                "_impl.light_xpos": jnp.concatenate([light_xpos + style.lamps, spare]),
+                "_impl.light_xdir": jnp.concatenate([light_xdir[..., 0], spare]),
             }
         )
 
-    def _colors(self, qpos: jax.Array) -> jax.Array:
+    def _widths(self, style: Style) -> jax.Array:
+        """How much wider cameras see than those that the contexts' rays are of."""
+        half = np.tan(np.deg2rad(self._model.cam_fovy[self._camera_ids]) / 2)
+        return jnp.tan(jnp.deg2rad(jnp.asarray(style.fovy)) / 2) / jnp.asarray(half, jnp.float32)
+
+    def _colors(self, qpos: jax.Array, style: Style) -> jax.Array:
         """Colours of the geoms; what does not glow has alpha 0, which rays pass."""
-        rgba = jnp.asarray(self._model.geom_rgba)
+        rgba = jnp.asarray(drawn_colors(self._model))
+        rgba = rgba.at[:, :3].multiply(jnp.asarray(style.colors)[self.scenery.instance_of_geom])
         for burner in self.scenery.burners:
             turned = burner.sign * qpos[np.array(burner.knobs)]
             is_on = (turned >= burner.bound if burner.inclusive else turned > burner.bound).any()
@@ -196,12 +257,13 @@ class RayRenderer:
     """Renders batches as ``vecenv.render.gl.GlRenderer`` does, without GL: one call of ``RayTracer`` for each scene.
 
     Args:
-        config: sizes and level of detail.
+        config: sizes, level of detail and cameras of one's own.
     """
 
     def __init__(self, config: RenderConfig) -> None:
         self._config = config
-        self._looks: dict[tuple, Any] = {}
+        self._own = {camera.name: camera for camera in config.cameras}
+        self._looks: dict[tuple, tuple[RayTracer, Any]] = {}
 
     def render(
         self,
@@ -216,21 +278,21 @@ class RayRenderer:
         Args:
             shots: one a slot; their stages count through ``problems``.
             problems, models: the scenes and their physics models.
-            cameras: names of the scenes' cameras.
+            cameras: names of the scenes' cameras or of the configuration's.
             wanted: which images.
 
         Raises:
-            RenderError: a scene has no such camera, or a slot has visual options.
+            RenderError: a scene has no such camera or instance, or a slot's options swap textures or colour materials.
         """
-        if any(shot.options != VisualOptions() for shot in shots):
-            raise RenderError("engine='raytrace' knows no visual options; use engine='gl'")
         size = (len(shots), self._config.height, self._config.width)
         rgb = {name: np.zeros((*size, 3), np.uint8) for name in cameras if wanted.rgb}
         depth = {name: np.zeros(size, np.float32) for name in cameras if wanted.depth}
         segmentation = {name: np.zeros(size, np.int16) for name in cameras if wanted.segmentation}
         for stage, (problem, model) in enumerate(zip(problems, models, strict=True)):
             slots = [slot for slot, shot in enumerate(shots) if shot.stage == stage]
-            seen = self._look(problem, tuple(cameras), wanted)(*_states(model, [shots[slot].pose for slot in slots]))
+            tracer, look = self._look(problem, tuple(cameras), wanted)
+            styles = self._styles(tracer, cameras, slots, [shots[slot].options for slot in slots])
+            seen = look(*_states(model, [shots[slot].pose for slot in slots]), *styles)
             for images, made in ((rgb, seen.rgb), (depth, seen.depth), (segmentation, seen.segmentation)):
                 for number, name in enumerate(cameras if images else ()):
                     images[name][slots] = np.asarray(made[:, number])
@@ -240,20 +302,83 @@ class RayRenderer:
         """Forget what was compiled. Closing twice is harmless."""
         self._looks = {}
 
-    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> Any:
+    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> tuple[RayTracer, Any]:
         key = (problem.scene_key(), cameras, wanted)
         if key not in self._looks:
-            rays = RayTracer(
+            tracer = RayTracer(
                 installed_scenery(problem, self._config.lod),
                 height=self._config.height,
                 width=self._config.width,
-                cameras=cameras,
+                cameras=[None if name in self._own else name for name in cameras],
                 rgb=wanted.rgb,
                 depth=wanted.depth,
                 segmentation=wanted.segmentation,
             )
-            self._looks[key] = jax.jit(jax.vmap(rays.look))
+            self._looks[key] = tracer, jax.jit(jax.vmap(tracer.look))
         return self._looks[key]
+
+    def _styles(
+        self, tracer: RayTracer, cameras: Sequence[str], slots: Sequence[int], options: Sequence[VisualOptions]
+    ) -> tuple[Style, ...]:
+        """The slots' styles, stacked; none where nothing differs from the scene's own look."""
+        if all(name not in self._own for name in cameras) and all(each == VisualOptions() for each in options):
+            return ()
+        own = [[self._own.get(name, name) for name in cameras]] * len(slots)
+        styles = [style_of(tracer, *each) for each in zip(options, own, slots, strict=True)]
+        return (jax.tree.map(lambda *arrays: np.stack(arrays), *styles),)
+
+
+def style_of(tracer: RayTracer, options: VisualOptions, cameras: Sequence[str | UserCamera], slot: int) -> Style:
+    """The style of a slot's visual options, and of its cameras, which are the tracer's.
+
+    Raises:
+        RenderError: the options swap textures, or colour what is no instance of the scene.
+    """
+    if options.textures:
+        raise RenderError("engine='raytrace' swaps no textures; use engine='gl'")
+    style = tracer.plain_style
+    style.light[:] = options.light * np.asarray(options.light_color)
+    style.lamps[:] = options.light_shift
+    for name, color in options.colors.items():
+        if name not in tracer.scenery.instances[1:]:
+            there = ", ".join(tracer.scenery.instances[1:])
+            raise RenderError(f"engine='raytrace' colours instances only, and {name!r} is none; there are {there}")
+        style.colors[tracer.scenery.instances.index(name)] = color
+    for number, camera in enumerate(cameras):
+        view = View(style.pos[number], style.turn[number], float(style.fovy[number]))
+        name = camera.name if isinstance(camera, UserCamera) else camera
+        view = View(*camera.in_slot(slot)) if isinstance(camera, UserCamera) else view
+        shift = next((options.cameras[key] for key in _names(name) if key in options.cameras), None)
+        view = view if shift is None else view.shifted(shift)
+        style.pos[number], style.turn[number], style.fovy[number] = view.pos, view.mat, view.fovy
+    return style
+
+
+def _names(camera: str) -> tuple[str, ...]:
+    """All names of a camera."""
+    real = ALIASES.get(camera, camera)
+    return real, *(alias for alias, other in ALIASES.items() if other == real)
+
+
+def _lamps(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """What MJX knows of lamps, with the headlight as one more if it is on."""
+    head, colors = model.vis.headlight, ("ambient", "diffuse", "specular")
+    more = {
+        "type": HEADLIGHT,
+        "castshadow": False,
+        "active": True,
+        "attenuation": (1, 0, 0),
+        "cutoff": 45,
+        "exponent": 0,
+    }
+    more |= {name: getattr(head, name) for name in colors}
+    found = {}
+    for name, value in more.items():
+        own = getattr(model, f"light_{name}")
+        dtype = {np.dtype(np.float64): np.float32, np.dtype(np.uint8): bool}.get(own.dtype, own.dtype)
+        extra = np.array([value] if head.active else [], own.dtype).reshape(-1, *own.shape[1:])
+        found[f"light_{name}"] = np.concatenate([own, extra]).astype(dtype)
+    return found
 
 
 def _states(model: mujoco.MjModel, shown: Sequence[Pose]) -> tuple[np.ndarray, ...]:

@@ -9,18 +9,12 @@ Each difference from the visual model has a reason:
   joined into one, and their colours into one small texture, the palette.
 * MuJoCo's GL averages a texture over the area that a pixel shows (mipmaps); MuJoCo Warp looks up one point. Textures
   are therefore reduced beforehand to about the size at which cameras see them.
-* GL limits the light of a point to 1, highlights included, before it applies the texture; MuJoCo Warp limits the
-  product and adds highlights in white. Textured surfaces that the lamps light with more than 1 are therefore darkened,
-  and their highlights scaled by the mean of the texture.
 * GL lights corners and blends between them, so large triangles have no highlights.
-* There are no mirrors (a stove's plate) and no transparency: a mirror glows a little, what is mostly transparent is
-  left out, what is mostly opaque is wholly so.
 * Sites that are seen, a burner that glows, become geoms.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
 import weakref
 from dataclasses import dataclass
@@ -34,20 +28,18 @@ from vecenv.libero import catalog
 from vecenv.libero.bddl import Problem
 from vecenv.libero.scene import Scene, compile_scene
 from vecenv.render import drawing, lod
-from vecenv.render.options import POLICY_CAMERAS, RenderError
+from vecenv.render.options import RenderError
 
+# Of the files; counts up when what is in them changes.
+_VERSION = 2
 # Longest side of a texture, texels.
 TEXTURE_SIDE = 256
 # MuJoCo draws a geom in its material's colour while the geom's own is this.
 _UNSET = np.array([0.5, 0.5, 0.5, 1.0])
-# What MuJoCo draws geoms without a material with.
-_PLAIN_SHINE = (0.5, 0.5, 0.0)
-_MESH, _BOX = int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_BOX)
+# The name of the texture that holds the colours of untextured meshes.
+PALETTE = "palette"
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
-# What lets more light through is left out: rays see no transparency.
-_OPAQUE = 0.5
-# A mirror's own light for each unit of its reflectance, in place of what it mirrors.
-_MIRRORED = 0.5
 # A surface of triangles with edges from here on, metres, has no highlights in GL, which lights corners only.
 _COARSE = 0.05
 # Groups of sites that MuJoCo draws unless told otherwise are those below.
@@ -99,7 +91,7 @@ class Scenery:
         """Write to a file that this version of MuJoCo can read."""
         buffer = np.zeros(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, buffer)
-        about = {"instances": self.instances, "burners": [vars(burner) for burner in self.burners]}
+        about = {"version": _VERSION, "instances": self.instances, "burners": [vars(burner) for burner in self.burners]}
         text = np.array(json.dumps(about))
         np.savez_compressed(path, model=buffer, about=text, instance_of_geom=self.instance_of_geom)
 
@@ -109,7 +101,7 @@ class Scenery:
 
         Raises:
             OSError: the file cannot be read.
-            RenderError: it is not such a file, or another MuJoCo wrote it.
+            RenderError: it is not such a file, or another MuJoCo or another version of vecenv wrote it.
         """
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
@@ -119,6 +111,8 @@ class Scenery:
             burners = tuple(Burner(**{**burner, "knobs": tuple(burner["knobs"])}) for burner in about["burners"])
         except (KeyError, ValueError, TypeError) as error:
             raise RenderError(f"{path}: no scenery that MuJoCo {mujoco.__version__} can read") from error
+        if about.get("version") != _VERSION:
+            raise RenderError(f"{path}: a scenery of another version of vecenv; write it anew")
         return cls(
             model=model,
             instances=tuple(about["instances"]),
@@ -154,13 +148,19 @@ _sceneries: weakref.WeakValueDictionary[tuple, Scenery] = weakref.WeakValueDicti
 
 
 class _Look(NamedTuple):
-    """What a surface is made of: texture (or -1), colour, repetition, shine. ``color`` None is for a palette."""
+    """What a surface is made of: texture (or -1), colour, repetition, and what MuJoCo's materials have besides.
 
-    texture: int
-    color: tuple[float, ...] | None
-    repeat: tuple[float, ...]
-    uniform: bool
-    shine: tuple[float, ...]
+    ``color`` None is for a palette. What has no material is of the defaults.
+    """
+
+    texture: int = -1
+    color: tuple[float, ...] | None = None
+    repeat: tuple[float, ...] = (1.0, 1.0)
+    uniform: bool = False
+    specular: float = 0.5
+    shininess: float = 0.5
+    emission: float = 0.0
+    reflectance: float = 0.0
 
 
 class _Corners(NamedTuple):
@@ -177,10 +177,11 @@ class _Flattening:
     def __init__(self, scene: Scene, texture_side: int, join: bool) -> None:
         self._scene, self._model, self._side, self._join = scene, scene.model, texture_side, join
         self._spec = _empty_spec(scene.model)
-        self._lamps = _Lamps(scene)
         self._bodies = [self._spec.worldbody]
-        for body in range(1, self._model.nbody):
-            self._bodies.append(self._spec.worldbody.add_body(name=self._model.body(body).name))
+        for body, (pos, quat) in enumerate(zip(*_layout(scene), strict=True)):
+            if body > 0:
+                name = self._model.body(body).name
+                self._bodies.append(self._spec.worldbody.add_body(name=name, pos=pos, quat=quat))
         self._palette: dict[tuple[float, ...], int] = {}
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[int, str] = {}
@@ -200,6 +201,7 @@ class _Flattening:
         _add_cameras(self._model, self._bodies)
         _add_lights(self._model, self._bodies)
         model = self._spec.compile()
+        _tighten(model)
         of_body = drawing.instances_of_bodies(self._model, self._scene)
         return Scenery(
             model=model,
@@ -214,7 +216,7 @@ class _Flattening:
     def _seen_geoms(self) -> list[int]:
         model = self._model
         groups = np.isin(model.geom_group, drawing.DRAWN_GROUPS)
-        return [geom for geom in np.flatnonzero(groups).tolist() if _color(model, geom)[3] >= _OPAQUE]
+        return [geom for geom in np.flatnonzero(groups).tolist() if _color(model, geom)[3] > 0]
 
     def _collect_palette(self) -> None:
         """All colours first: where a colour lies in the palette depends on how many there are."""
@@ -224,11 +226,12 @@ class _Flattening:
 
     def _joins(self, geom: int) -> bool:
         model = self._model
-        return self._join and int(model.geom_type[geom]) == _MESH and _texture(model, geom) < 0
+        is_plain = int(model.geom_type[geom]) == _MESH and _texture(model, geom) < 0
+        return self._join and is_plain and _color(model, geom)[3] == 1
 
     def _add_geom(self, geom: int) -> None:
         model, body = self._model, int(self._model.geom_bodyid[geom])
-        kind, look = int(model.geom_type[geom]), self._lit(geom, _look(model, geom))
+        kind, look = int(model.geom_type[geom]), _look(model, geom)
         if self._joins(geom):
             corners = _corners(model, geom)
             place = (self._palette[_color(model, geom)[:3]] + 0.5) / len(self._palette)
@@ -243,27 +246,14 @@ class _Flattening:
             pose = {"pos": model.geom_pos[geom], "quat": model.geom_quat[geom]}
             self._shape(body, kind, model.geom_size[geom], self._material(look), **pose)
 
-    def _lit(self, geom: int, look: _Look) -> _Look:
-        """Shine and colour that look in MuJoCo Warp as the geom's do in GL."""
-        specular, shininess, emission = look.shine
-        if shininess == 0:  # to GL its highlight is everywhere, and wears the texture
-            emission, specular, shininess = emission + specular * self._lamps.everywhere(), 0.0, 1.0
-        glow, color = _MIRRORED * _reflectance(self._model, geom), look.color
-        if look.texture < 0 or color is None:
-            return look._replace(shine=(specular, shininess, emission + glow))
-        specular *= float(self._image(look.texture).mean() / 255)
-        scale = round(self._lamps.scale(geom, emission), 3)
-        color = (*(scale * x for x in color[:3]), color[3])
-        return look._replace(color=color, shine=(specular, shininess, emission + glow / scale))
-
     def _shape(self, body: int, kind: int, size: Any, material: str, **more: Any) -> None:
         self._bodies[body].add_geom(
             type=mujoco.mjtGeom(kind), size=size, material=material, group=1, contype=0, conaffinity=0, **more
         )
 
     def _add_mesh(self, name: str, body: int, look: _Look, corners: _Corners) -> None:
-        if _edge(corners) > _COARSE:
-            look = look._replace(shine=(0.0, *look.shine[1:]))
+        if look.shininess > 0 and _edge(corners) > _COARSE:
+            look = look._replace(specular=0.0)
         arrays = {}
         for key, values in (("vert", corners.pos), ("normal", corners.normal), ("texcoord", corners.uv)):
             distinct, rows = _distinct(values.reshape(-1, values.shape[-1]))
@@ -277,9 +267,13 @@ class _Flattening:
     def _material(self, look: _Look) -> str:
         if look not in self._materials:
             name = self._materials[look] = f"material{len(self._materials)}"
-            specular, shininess, emission = look.shine
             material = self._spec.add_material(
-                name=name, rgba=look.color or np.ones(4), specular=specular, shininess=shininess, emission=emission
+                name=name,
+                rgba=look.color or np.ones(4),
+                specular=look.specular,
+                shininess=look.shininess,
+                emission=look.emission,
+                reflectance=look.reflectance,
             )
             material.texrepeat, material.texuniform = np.array(look.repeat), look.uniform
             texture = self._palette_texture() if look.color is None else self._texture(look.texture)
@@ -290,7 +284,7 @@ class _Flattening:
     def _palette_texture(self) -> str:
         if -1 not in self._textures:
             colors = np.rint(255 * np.array(list(self._palette))).astype(np.uint8)
-            self._textures[-1] = self._add_texture("palette", colors[None])
+            self._textures[-1] = self._add_texture(PALETTE, colors[None])
         return self._textures[-1]
 
     def _image(self, index: int) -> np.ndarray:
@@ -319,12 +313,62 @@ class _Flattening:
         for site in _seen_sites(model):
             name = f"site{site}"
             rgba = tuple(float(x) for x in model.site_rgba[site])
-            look = _Look(-1, rgba, (1.0, 1.0), False, _PLAIN_SHINE)
+            look = _Look(color=rgba)
             pose = {"pos": model.site_pos[site], "quat": model.site_quat[site]}
             kind, body = int(model.site_type[site]), int(model.site_bodyid[site])
             self._shape(body, kind, model.site_size[site], self._material(look), name=name, **pose)
             if site in tests:
                 self._glows[name] = tests[site]
+
+
+def _layout(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """About where bodies are, [nbody, 3] and wxyz [nbody, 4]: the robot as it starts, things side by side on the table.
+
+    Ray tracers sort what they see into a tree by where it is in the model, and only stretch its boxes afterwards.
+    """
+    model, data = scene.model, mujoco.MjData(scene.model)
+    mujoco.mj_kinematics(model, data)
+    pos = data.xpos.copy()
+    side = int(np.ceil(np.sqrt(max(len(scene.entities), 1))))
+    low, high = scene.workspace_bounds
+    for number, entity in enumerate(scene.entities.values()):
+        root = model.body(entity.root_body).id
+        cell = np.array([number // side, number % side, 0]) + np.array([0.5, 0.5, 0])
+        place = low + (high - low) * cell / side
+        pos[model.body_rootid == root] += np.array([*place[:2], scene.base_z]) - data.xpos[root]
+    return pos, data.xquat.copy()
+
+
+def _tighten(model: mujoco.MjModel) -> None:
+    """Give meshes frames whose boxes around the origin, by which ray tracers find them, are small: centred, and along
+    the mesh's principal axes as MuJoCo leaves it, or its body's. Every mesh is of one geom.
+    """
+    for geom in np.flatnonzero(model.geom_type == _MESH):
+        mesh, turn = int(model.geom_dataid[geom]), _matrix(model.geom_quat[geom])
+        vert, normal = _rows(model, "vert", mesh), _rows(model, "normal", mesh)
+        if _surface(np.ptp(vert @ turn.T, axis=0)) < _surface(np.ptp(vert, axis=0)):
+            vert[:], normal[:] = vert @ turn.T, normal @ turn.T
+            model.geom_quat[geom], turn = (1, 0, 0, 0), np.eye(3)
+        middle = (vert.min(0) + vert.max(0)) / 2
+        vert -= middle
+        model.geom_pos[geom] += turn @ middle
+        model.geom_size[geom] = np.abs(vert).max(0)
+
+
+def _rows(model: mujoco.MjModel, name: str, mesh: int) -> np.ndarray:
+    """A view of a mesh's vertices or normals."""
+    start = getattr(model, f"mesh_{name}adr")[mesh]
+    return getattr(model, f"mesh_{name}")[start : start + getattr(model, f"mesh_{name}num")[mesh]]
+
+
+def _matrix(quat: np.ndarray) -> np.ndarray:
+    out = np.zeros(9)
+    mujoco.mju_quat2Mat(out, quat)
+    return out.reshape(3, 3)
+
+
+def _surface(sides: np.ndarray) -> float:
+    return float(sides @ np.roll(sides, 1))
 
 
 def _seen_sites(model: mujoco.MjModel) -> list[int]:
@@ -385,95 +429,15 @@ def _add_lights(model: mujoco.MjModel, bodies: list[Any]) -> None:
         )
 
 
-class _Lamps:
-    """How a scene's lamps light surfaces, seen by the agent's camera and by one that looks down.
-
-    The headlight shines where the camera looks. Things that move count as being anywhere in the workspace.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        self._model, self._data = scene.model, mujoco.MjData(scene.model)
-        mujoco.mj_kinematics(self._model, self._data)
-        low, high = scene.workspace_bounds
-        steps = (0.25, 0.5, 0.75)
-        self._workspace = np.array([[*(low + (high - low) * (u, v, 0))[:2], low[2]] for u in steps for v in steps])
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, self._model.camera(POLICY_CAMERAS[0]).quat)
-        self._backwards = np.stack([turn.reshape(3, 3)[:, 2], [0.0, 0.0, 1.0]])
-
-    def everywhere(self) -> float:
-        """What a surface that shines in all directions adds, for each unit of its ``specular``."""
-        model = self._model
-        middle = self._workspace.mean(0)
-        strengths = np.array([_strength(model, light, middle)[0] for light in range(model.nlight)])
-        return float(model.vis.headlight.specular.mean() + strengths @ model.light_specular.mean(1))
-
-    def scale(self, geom: int, emission: float) -> float:
-        """By what a textured geom's colour is to be scaled so that light beyond 1 does not show, at most 1.
-
-        The factor that comes closest, in least squares over the surface that the two cameras see, to limiting light
-        to 1.
-        """
-        normal, area = self._surface(geom)
-        above = below = 0.0
-        for back, point in itertools.product(self._backwards, self._places(geom)):
-            weight = area * np.maximum(normal @ back, 0)
-            light = emission + self._light(point, normal, back)
-            above += float(weight @ (light * np.minimum(light, 1)))
-            below += float(weight @ light**2)
-        return above / below if below > 0 else 1.0
-
-    def _surface(self, geom: int) -> tuple[np.ndarray, np.ndarray]:
-        """Normals [n, 3] in the world frame of pieces of a geom's surface, and their areas [n]."""
-        model, turn = self._model, self._data.geom_xmat[geom].reshape(3, 3)
-        if model.geom_type[geom] == _MESH:
-            mesh = lod.Mesh.of(model, int(model.geom_dataid[geom]))
-            area = _areas(mesh.vert[mesh.face])
-            return mesh.normal[mesh.face_normal].mean(1) @ turn.T, area
-        x, y, z = np.maximum(model.geom_size[geom], 1e-3)
-        return np.concatenate([turn.T, -turn.T]), np.tile([y * z, x * z, x * y], 2)
-
-    def _places(self, geom: int) -> np.ndarray:
-        """Where a geom may be, or parts of it if it is fixed and no plane, [n, 3]."""
-        is_endless = self._model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE
-        if is_endless or self._model.body_weldid[self._model.geom_bodyid[geom]] != 0:
-            return self._workspace
-        center, half = np.split(self._model.geom_aabb[geom], 2)
-        signs = np.array(list(itertools.product((-0.5, 0.0, 0.5), repeat=3)))
-        return self._data.geom_xpos[geom] + (center + signs * half) @ self._data.geom_xmat[geom].reshape(3, 3).T
-
-    def _light(self, point: np.ndarray, normal: np.ndarray, back: np.ndarray) -> np.ndarray:
-        """Light on surfaces with these normals at a point, [n], while a camera looks along ``-back``."""
-        model, head = self._model, self._model.vis.headlight
-        total = head.ambient.mean() + model.light_ambient.mean(1).sum()
-        total = total + head.diffuse.mean() * np.maximum(normal @ back, 0)
-        for light in range(model.nlight):
-            strength, towards = _strength(model, light, point)
-            total = total + model.light_diffuse[light].mean() * strength * np.maximum(normal @ towards, 0)
-        return total
-
-
-def _strength(model: mujoco.MjModel, light: int, point: np.ndarray) -> tuple[float, np.ndarray]:
-    """A lamp's strength at a point, and the direction to it [3]."""
-    aim = model.light_dir[light]
-    if not model.light_active[light]:
-        return 0.0, -aim
-    if model.light_type[light] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
-        return 1.0, -aim
-    ray = point - model.light_pos[light]
-    distance = float(np.linalg.norm(ray))
-    cosine = float(ray @ aim / distance)
-    strength = 1 / float(model.light_attenuation[light] @ [1, distance, distance**2])
-    if model.light_type[light] == mujoco.mjtLightType.mjLIGHT_SPOT:
-        lit = cosine >= np.cos(np.deg2rad(model.light_cutoff[light]))
-        strength *= max(cosine, 0.0) ** float(model.light_exponent[light]) if lit else 0.0
-    return strength, -ray / distance
-
-
 def _areas(triangles: np.ndarray) -> np.ndarray:
     """Areas [n] of triangles [n, 3, 3]."""
     sides = np.diff(triangles.astype(float), axis=1)
     return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+
+
+def drawn_colors(model: mujoco.MjModel) -> np.ndarray:
+    """Red, green, blue, alpha that geoms are drawn in (times their textures), float32 [ngeom, 4]."""
+    return np.array([_color(model, geom) for geom in range(model.ngeom)], np.float32).reshape(-1, 4)
 
 
 def _color(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
@@ -488,28 +452,25 @@ def _texture(model: mujoco.MjModel, geom: int) -> int:
     return int(model.mat_texid[material, _RGB]) if material >= 0 else -1
 
 
-def _reflectance(model: mujoco.MjModel, geom: int) -> float:
-    """How much of a mirror MuJoCo makes of a box's upper face, or of a plane."""
-    material, mirrors = int(model.geom_matid[geom]), (_BOX, int(mujoco.mjtGeom.mjGEOM_PLANE))
-    return float(model.mat_reflectance[material]) if material >= 0 and model.geom_type[geom] in mirrors else 0.0
-
-
 def _look(model: mujoco.MjModel, geom: int) -> _Look:
-    material = int(model.geom_matid[geom])
-    color = _color(model, geom)
+    material, color = int(model.geom_matid[geom]), _color(model, geom)
     if material < 0:
-        return _Look(-1, color, (1.0, 1.0), False, _PLAIN_SHINE)
-    shine = (model.mat_specular[material], model.mat_shininess[material], model.mat_emission[material])
-    repeat, uniform = tuple(model.mat_texrepeat[material].tolist()), bool(model.mat_texuniform[material])
-    return _Look(_texture(model, geom), color, repeat, uniform, tuple(float(x) for x in shine))
+        return _Look(color=color)
+    return _Look(
+        texture=_texture(model, geom),
+        color=color,
+        repeat=tuple(model.mat_texrepeat[material].tolist()),
+        uniform=bool(model.mat_texuniform[material]),
+        specular=float(model.mat_specular[material]),
+        shininess=float(model.mat_shininess[material]),
+        emission=float(model.mat_emission[material]),
+        reflectance=float(model.mat_reflectance[material]),
+    )
 
 
 def _corners(model: mujoco.MjModel, geom: int) -> _Corners:
     """The triangles of a mesh geom in its body's frame."""
-    mesh = lod.Mesh.of(model, int(model.geom_dataid[geom]))
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    turn = turn.reshape(3, 3)
+    mesh, turn = lod.Mesh.of(model, int(model.geom_dataid[geom])), _matrix(model.geom_quat[geom])
     pos = mesh.vert[mesh.face] @ turn.T + model.geom_pos[geom]
     normal = mesh.normal[mesh.face_normal] @ turn.T
     uv = mesh.texcoord[mesh.face_texcoord] if len(mesh.texcoord) else _projected(model, geom, mesh)
