@@ -23,12 +23,16 @@ _PUSH_PITCHES = np.deg2rad([0.0, 20.0, 40.0])
 _YAWS = np.deg2rad([-20.0, -10.0, 0.0, 10.0, 20.0])
 # Where along the front, as a share of half its width.
 _PLACES = (-0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6)
-# Fingertips come this far below the edge, from this far above it, the hand starts this far before it, and presses this
-# deep, metres.
-_HOOKED, _OVER, _BEFORE, _PRESS = 0.005, 0.025, 0.18, 0.005
+# Fingertips come this far below the edge (more than a stop's tolerance); the hand starts this far before it, and
+# presses this deep, metres.
+_HOOKED, _BEFORE, _PRESS = 0.02, 0.18, 0.005
+# They come from so far above where they then are, metres; the second time higher: an arm that reaches far sags.
+_OVERS = (0.025, 0.035)
 # Two stops on the way in, as shares of it that are left. From the second on the hand moves level, because the arm sags
 # below a straight line, by about this much (metres).
-_ENTRY, _SAGS = (1.0, 0.3), 0.01
+_ENTRY, _SAGS = (1.0, 0.3), 0.02
+# The hand ends this far above the edge, metres.
+_LEAVE = 0.06
 # Fingers may slip this far before they take the drawer along, metres.
 _SLACK = 0.06
 # Pushing begins so far before the front, and goes on so far beyond closed.
@@ -37,6 +41,8 @@ _AWAY, _BEYOND = 0.06, 0.01
 _PREFER_STRAIGHT, _PREFER_MIDDLE = 1.0, 0.2
 # So does every radian that the hand is turned on the way there.
 _PREFER_NEAR = 0.15
+# So many of the best are followed exactly; every stop that is not reached costs as much as this, radians.
+_FOLLOWED, _UNREACHED = 16, 1.0
 # More room than this is no better, radians.
 _ROOM_ENOUGH = 0.3
 
@@ -52,19 +58,24 @@ class _Facing:
     turn: np.ndarray
 
 
-def hook_and_pull(arm: Arm, qpos: np.ndarray, base: np.ndarray, drawer: Part, opened: float) -> list[Waypoint]:
-    """Open a drawer until its joint is at ``opened``, metres; the hand ends where it can leave upwards."""
-    joint, edge = _joint(drawer), _upper_edge(drawer)
+def hook_and_pull(
+    arm: Arm, qpos: np.ndarray, base: np.ndarray, drawer: Part, opened: float, before: int
+) -> list[Waypoint]:
+    """Open a drawer until its joint is at ``opened``, metres; the hand ends where it can leave upwards.
+
+    ``before`` is how often that was tried before.
+    """
+    joint, edge, clear = _joint(drawer), _upper_edge(drawer), _OVERS[before % len(_OVERS)]
 
     def way(facing: _Facing) -> list[np.ndarray]:
         behind = (_HOOKED + arm.hand.thickness / np.cos(facing.pitch)) / np.tan(facing.pitch)
         tip = np.array([edge[0, 0] - behind, _along(edge, facing.place), edge[1, 2] - _HOOKED])
         at = tip - arm.hand.tip * facing.approach
-        over, pressed = at + [0, 0, _OVER], at - [0, 0, _PRESS]
+        over, pressed = at + [0, 0, clear], at - [0, 0, _PRESS]
         pulled = pressed + (opened + _SLACK - joint.opened) * joint.axis
-        before, outside = (over - share * _BEFORE * facing.approach for share in _ENTRY)
+        begin, outside = (over - share * _BEFORE * facing.approach for share in _ENTRY)
         inside = np.array([*outside[:2], over[2] + _SAGS])
-        return [before, inside, over, at, pulled, pulled + [0, 0, 2 * _OVER]]
+        return [begin, inside, over, at, pulled, pulled + [0, 0, _LEAVE]]
 
     stops, turn = _best(arm, qpos, base, _HOOK_PITCHES, way)
     return through(stops, turn, 1.0)
@@ -110,8 +121,12 @@ def _best(
     _, now = arm.tool(qpos, base)
     far = np.linalg.norm(rotvec_from_rotation(turns @ now.T), axis=1)
     dear = np.array([_PREFER_STRAIGHT * abs(each.yaw) + _PREFER_MIDDLE * abs(each.place) for each in facings])
-    best = int(np.argmax(np.minimum(room, _ROOM_ENOUGH) - dear - _PREFER_NEAR * far))
-    return ways[best], turns[best]
+    dear += _PREFER_NEAR * far
+    best = np.argsort(dear - np.minimum(room, _ROOM_ENOUGH), kind="stable")[:_FOLLOWED]
+    room, reached = arm.follow(qpos, base, ways[best], np.repeat(turns[best, None], ways.shape[1], axis=1))
+    worth = np.minimum(room, _ROOM_ENOUGH) - dear[best] - _UNREACHED * (ways.shape[1] - reached)
+    one = best[int(np.argmax(worth))]
+    return ways[one], turns[one]
 
 
 def _facing(arm: Arm, pitch: float, yaw: float, place: float, flip: float) -> _Facing:

@@ -29,6 +29,8 @@ _SKIN = 0.006
 _GROUND = 0.003
 # So many alternatives are rehearsed at once, and so many times if none will do.
 _REHEARSED, _ROUNDS = 48, 12
+# Of those, so many are followed exactly; every stop that is not reached costs this.
+_FOLLOWED, _UNREACHED = 8, 3.0
 # A grasp with this much room at the joints' limits is as good as one with more, radians.
 _ROOMY = 0.15
 # What it costs to have no room at all.
@@ -93,14 +95,21 @@ def choose(
         best = ranked[begin : begin + _REHEARSED]
         stops, turns = course(offers.position[best], offers.rotation[best], offers.approach[best])
         room, _ = arm.rehearse(qpos, base, stops, turns)
-        total = cost[best] + _STRAIN * np.clip(_ROOMY - np.maximum(room, -10.0), 0.0, None) / _ROOMY
+        some = np.argsort(cost[best] + _strain(room), kind="stable")[:_FOLLOWED]
+        room, reached = arm.follow(qpos, base, stops[some], turns[some])
+        total = cost[best[some]] + _strain(room) + _UNREACHED * (stops.shape[1] - reached)
         one = int(np.argmin(total))
-        at = best[one]
+        at = best[some[one]]
         pose = offers.position[at], offers.rotation[at], offers.approach[at]
         found.append(Grasp(*pose, room=float(room[one]), cost=float(total[one])))
-        if room[one] >= _ROOMY:
+        if room[one] >= _ROOMY and reached[one] == stops.shape[1]:
             break
     return min(found, key=lambda grasp: grasp.cost, default=None)
+
+
+def _strain(room: np.ndarray) -> np.ndarray:
+    """What it costs to have so little room, [C]."""
+    return _STRAIN * np.clip(_ROOMY - np.maximum(room, -10.0), 0.0, None) / _ROOMY
 
 
 def approaches() -> np.ndarray:

@@ -66,9 +66,10 @@ class Look:
 
 @dataclass
 class Memory:
-    """What a slot remembers between attempts: grasps that did not hold."""
+    """What a slot remembers between attempts: grasps that did not hold, and how often a drawer was pulled."""
 
     failed: list[Grasp] = field(default_factory=list)
+    pulls: int = 0
 
 
 Script: TypeAlias = Generator[list[Waypoint], Look, None]
@@ -126,9 +127,7 @@ def open_drawer(arm: Arm, look: Look, memory: Memory) -> Script:
 
     The handles are only drawn: upstream's cabinet has no collision shapes there.
     """
-    del memory
-    drawer = look.snapshot.parts[look.snapshot.goal[0][-1]]
-    yield drawers.hook_and_pull(arm, look.qpos, look.base, drawer, _OPENED)
+    yield _pull(arm, look, memory, look.snapshot.goal[0][-1])
 
 
 def close_drawer(arm: Arm, look: Look, memory: Memory) -> Script:
@@ -147,15 +146,17 @@ def put_in(arm: Arm, look: Look, memory: Memory) -> Script:
         yield [Waypoint(look.snapshot.ee_pose, 0.0, hold=5)]
         return
     if drawer.joint.opened < _OPENED / 2:
-        look = yield drawers.hook_and_pull(arm, look.qpos, look.base, drawer, _OPENED)
+        look = yield _pull(arm, look, memory, name)
     middle, half = look.middle(source), look.middle(source) - look.low(source)
     place = drawers.opening(look.snapshot.parts[name])
     place[1] = np.clip(middle[1], place[1] - _ASIDE, place[1] + _ASIDE)
     place[2] += half[2] + _GAP
     grasp = _choose(arm, look, memory, source, place - middle)
     if grasp is None or grasp.cost > _DOUBTFUL:
-        yield _sweep(arm, look, source, place)
-        return
+        pushing, reached = _sweep(arm, look, source, place)
+        if reached or grasp is None:
+            yield pushing
+            return
     taken = yield from _hold(arm, look, memory, source, grasp)
     if taken is None:
         return
@@ -164,8 +165,14 @@ def put_in(arm: Arm, look: Look, memory: Memory) -> Script:
     yield from _set_down(np.array([*there[:2], here[2]]), there, turn)
 
 
-def _sweep(arm: Arm, look: Look, name: str, place: np.ndarray) -> list[Waypoint]:
-    """Push a thing with closed fingers, from behind, over the edge of what it stands on, towards ``place`` [3]."""
+def _pull(arm: Arm, look: Look, memory: Memory, name: str) -> list[Waypoint]:
+    memory.pulls += 1
+    return drawers.hook_and_pull(arm, look.qpos, look.base, look.snapshot.parts[name], _OPENED, memory.pulls - 1)
+
+
+def _sweep(arm: Arm, look: Look, name: str, place: np.ndarray) -> tuple[list[Waypoint], bool]:
+    """Push a thing with closed fingers, from behind, over the edge of what it stands on, towards ``place`` [3]; and
+    whether the arm can."""
     low, high = look.low(name), look.high(name)
     behind = np.array([low[0] - _BEHIND, (low[1] + high[1]) / 2, low[2] + _SKIMMING])
     end = np.array([place[0], *behind[1:]])
@@ -176,9 +183,10 @@ def _sweep(arm: Arm, look: Look, name: str, place: np.ndarray) -> list[Waypoint]
     opening = np.concatenate([opening, -opening]) / np.linalg.norm(np.tile(opening, (2, 1)), axis=1, keepdims=True)
     turns = arm.hand.rotation(np.concatenate([approach, approach]), opening)
     ways = np.repeat(np.array(stops)[None], len(turns), axis=0)
-    room, _ = arm.rehearse(look.qpos, look.base, ways, np.repeat(turns[:, None], len(stops), axis=1))
-    best = int(np.argmax(np.minimum(room, _ROOM_ENOUGH) - _PREFER_UPRIGHT * np.tile(tilts, 2)))
-    return through(stops, turns[best], 1.0)
+    room, reached = arm.follow(look.qpos, look.base, ways, np.repeat(turns[:, None], len(stops), axis=1))
+    worth = np.minimum(room, _ROOM_ENOUGH) - _PREFER_UPRIGHT * np.tile(tilts, 2) + reached
+    best = int(np.argmax(worth))
+    return through(stops, turns[best], 1.0), bool(reached[best] == len(stops))
 
 
 def _take(arm: Arm, look: Look, memory: Memory, name: str, way: np.ndarray) -> Taking:

@@ -8,7 +8,7 @@ limits, so a pose that some posture could take may still be out of reach along t
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -23,12 +23,15 @@ from vecenv.simpler.kinematics import (
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
-from vecenv.simpler.robots import GOOGLE_ROBOT, WIDOWX, Robot
+from vecenv.simpler.robots import GOOGLE_ROBOT, WIDOWX, Robot, controller
+from vecenv.simpler.servo import Servo, ServoConfig
 
 # Steps of the way at which the inverse kinematics is solved anew, metres and radians: what a control tick covers.
 _STRIDE, _TURN = 0.05, 0.3
 # Like the controllers' inverse kinematics, but it takes larger steps: a rehearsal need not be as exact.
 _QUICK = Clik(tolerance=1e-3, max_iterations=40, step=0.4)
+# Following a way: ticks that it may take to one stop, set-points a tick.
+_PATIENCE, _SET_POINTS = 40, 8
 # Joints are to stay so far from their limits, radians.
 _SPARE = 0.03
 
@@ -108,9 +111,12 @@ class Arm:
     """
 
     def __init__(self, robot: Robot, root: Path) -> None:
-        urdf = read_urdf(root / robot.urdf_path())
+        self._urdf = root / robot.urdf_path()
+        urdf = read_urdf(self._urdf)
         self.robot, self.hand = robot, HANDS[robot.name]
         self.chain: Chain = urdf.chain(robot.tool, robot.joints)
+        # A few set-points a tick are all that following a way needs.
+        self._coarse = replace(robot, sim_hz=_SET_POINTS * robot.control_hz)
         self._limits = urdf.limits(robot.joints)[self.chain.columns]
 
     def tool(self, qpos: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -141,6 +147,64 @@ class Arm:
             joints, room = self._go(joints, goals[:, stop], turns[:, stop])
             spare, visited[:, stop] = np.minimum(spare, room), joints
         return spare - _SPARE, visited
+
+    def follow(
+        self, qpos: np.ndarray, base: np.ndarray, positions: np.ndarray, rotations: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Follow ways tick by tick as ``step_waypoints`` does, with the robot's controller and drives that lag.
+
+        Dearer than ``rehearse`` and closer to what will happen: joints take their time, so the hand leaves the straight
+        way, and near a singular posture the arm may end in another one. Nothing is in the way here, and the arm has no
+        weight: a drive's damping over its stiffness (0.6 s in the Google Robot's arm) is how long a joint lags.
+
+        Args:
+            qpos, base, positions, rotations: as for ``rehearse``.
+
+        Returns:
+            Room at the joints' limits, radians, [C]; and how many stops were reached one after the other, [C].
+        """
+        count, stops = positions.shape[:2]
+        targets = np.concatenate([pose(positions, rotations), np.zeros((count, stops, 1))], axis=2)
+        servo = Servo(controller(self._coarse, self._urdf, count), ServoConfig.of(self.robot))
+        rows, at, ticks = np.arange(count), np.zeros(count, int), np.zeros(count, int)
+        seen = {"qpos": np.repeat(qpos[None], count, axis=0), "base": np.repeat(base[None], count, axis=0)}
+        servo.controller.reset(np.ones(count, bool), seen["qpos"])
+        seen["tcp"] = self._tools(seen)
+        servo.begin(seen["tcp"])
+        room, going = np.full(count, np.inf), np.ones(count, bool)
+        while going.any():
+            wanted = targets[rows, np.minimum(at, stops - 1)]
+            actions = servo.actions(wanted, going, seen)
+            points = servo.controller.set_action(actions, seen["qpos"], np.zeros_like(seen["qpos"]), going)
+            moved = np.where(going[:, None], self._dragged(seen["qpos"], points.position), seen["qpos"])
+            room = np.where(going, np.minimum(room, self._room(moved)), room)
+            seen["qpos"] = self._clipped(moved)
+            seen["tcp"] = self._tools(seen)
+            stuck = servo.stuck(wanted, seen["tcp"], going)
+            arrived = going & servo.arrived(wanted, seen["tcp"])
+            at, ticks = at + arrived, np.where(arrived, 0, ticks + 1)
+            going &= (at < stops) & ~(stuck & ~arrived) & (ticks < _PATIENCE)
+        return room - _SPARE, at
+
+    def _dragged(self, joints: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Where drives that lag behind their set-points [C, S, N] take the joints [C, N] in a tick."""
+        lag = np.array([drive.damping / drive.stiffness for drive in self.robot.drives])
+        left = np.exp(-1 / (self._coarse.sim_hz * lag))
+        for point in points.swapaxes(0, 1):
+            joints = point + (joints - point) * left
+        return joints
+
+    def _clipped(self, joints: np.ndarray) -> np.ndarray:
+        """Joints [C, N] that stop at the limits of the tool's chain."""
+        clipped = joints.copy()
+        clipped[:, self.chain.columns] = np.clip(joints[:, self.chain.columns], *self._limits.T)
+        return clipped
+
+    def _tools(self, seen: dict[str, np.ndarray]) -> np.ndarray:
+        """World poses of the tools, [C, 7]."""
+        position, rotation = self.chain.pose(seen["qpos"])
+        turn = rotation_from_quat(seen["base"][:, 3:7])
+        return pose(seen["base"][:, :3] + np.einsum("nij,nj->ni", turn, position), turn @ rotation)
 
     def _go(self, joints: np.ndarray, goal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Straight to a pose, shifting and turning each at its own pace as ``step_waypoints`` does: joints there [C, N]

@@ -76,7 +76,7 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
     notes: list[str] = []
     spec = SceneSpec(
         # The robot's versions differ in colour only, so scenes without pictures share the plain one.
-        robot=robot_body(task.robot, root / task.robot.urdf_path()),
+        robot=robot_body(task.robot, root / task.robot.urdf_path(), layout.qpos),
         sim_hz=task.sim_hz,
         contact_offset=task.contact_offset,
         objects=tuple(_body(placed, models, root, notes) for placed in layout.objects),
@@ -89,8 +89,11 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
     )
 
 
-def robot_body(robot: Robot, urdf: Path) -> RobotBody:
-    """A robot as physics sees it, with the remedies for PhysX 5 (``scenes.py``)."""
+def robot_body(robot: Robot, urdf: Path, qpos: Sequence[float] | None = None) -> RobotBody:
+    """A robot as physics sees it, with the remedies for PhysX 5 (``scenes.py``).
+
+    Joints that nothing moves stay frozen where ``qpos`` [N] has them; without it they are left free.
+    """
     drives, google, pairs = robot.drives, robot.name == GOOGLE_ROBOT.name, list(robot.never_touch)
     armature = [GOOGLE_FINGER_ARMATURE if i in robot.gripper else 0.0 for i in range(robot.dof)]
     if google:
@@ -112,6 +115,7 @@ def robot_body(robot: Robot, urdf: Path) -> RobotBody:
         ),
         armature=tuple(armature) if google else (),
         stop=(*robot.gripper, GOOGLE_FINGER_STOP) if google else None,
+        frozen=() if qpos is None else tuple((robot.joints[i], float(qpos[i])) for i in robot.still),
     )
 
 

@@ -103,6 +103,7 @@ class Robot:
         fingers: the left and the right side.
         grasp_angle: largest angle between a finger's push and its opening direction that counts as a grasp, degrees.
         never_touch: pairs of links whose contact is ignored.
+        still: columns of qpos that no action moves: joints which hang on the fixed root, beside the arm.
     """
 
     name: str
@@ -120,6 +121,7 @@ class Robot:
     fingers: tuple[Finger, Finger]
     grasp_angle: float
     never_touch: tuple[tuple[str, str], ...] = ()
+    still: tuple[int, ...] = ()
 
     @property
     def dof(self) -> int:
@@ -227,6 +229,7 @@ GOOGLE_ROBOT = Robot(
     ),
     arm=(0, 1, 2, 3, 4, 5, 6, 9, 10),
     gripper=(7, 8),
+    still=(9, 10),
     control_hz=3,
     sim_hz=513,
     # A hundredth of a radian beyond the joints' range (-0.0001 to 1.3), for the same reason.
@@ -487,4 +490,4 @@ class GoogleController(Controller):
 def controller(robot: Robot, urdf: Path, count: int) -> WidowXController | GoogleController:
     """The controller of B = ``count`` robots, with the kinematics of a URDF file."""
     kinds = {WIDOWX.name: WidowXController, GOOGLE_ROBOT.name: GoogleController}
-    return kinds[robot.name](robot.chain(urdf), count)
+    return kinds[robot.name](robot.chain(urdf), count, robot)

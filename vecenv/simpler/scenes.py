@@ -74,6 +74,7 @@ class RobotBody:
         fingers: links that grasp.
         armature: kg m2 (or kg) added to the joints, [dof]; empty for none. See ``GOOGLE_FINGER_ARMATURE``.
         stop: the two finger joints, and what they may add up to; None for no limit. See ``GOOGLE_FINGER_STOP``.
+        frozen: joints that stay where an episode begins, and their angles (radians): physics leaves them out.
     """
 
     urdf: Path
@@ -87,6 +88,7 @@ class RobotBody:
     fingers: tuple[Finger, ...]
     armature: tuple[float, ...] = ()
     stop: tuple[int, int, float] | None = None
+    frozen: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,13 +290,15 @@ class Scene:
             ignored=dict(body.ignored),
             many_hulls=True,
             visuals=self._visuals,
+            frozen=dict(body.frozen),
         )
-        gains = zip(robot.joints, body.stiffness, body.damping, body.force_limit, strict=True)
-        for joint, stiffness, damping, limit in gains:
-            joint.set_drive_properties(stiffness, damping, force_limit=limit, mode="force")
+        for i, joint in robot.joints.items():
+            joint.set_drive_properties(
+                body.stiffness[i], body.damping[i], force_limit=body.force_limit[i], mode="force"
+            )
             joint.set_friction(0.0)
-        for joint, armature in zip(robot.joints, body.armature, strict=False):
-            joint.set_armature(np.array([armature], np.float32))
+            if body.armature:
+                joint.set_armature(np.array([body.armature[i]], np.float32))
         # Gravity is compensated in any case; without it the robot can sleep while objects settle.
         for link in robot.physx.links:
             link.set_disable_gravity(True)
@@ -309,7 +313,7 @@ class Scene:
             self.sapien, cabinet.urdf, joints=joints, surfaces={}, ignored={}, many_hulls=False, visuals=self._visuals
         )
         made.physx.set_root_pose(pose_of(cabinet.pose))
-        for joint in made.joints:
+        for joint in made.joints.values():
             joint.set_friction(cabinet.friction)
             joint.set_drive_properties(0.0, cabinet.damping)
         return made
@@ -357,7 +361,7 @@ class Scene:
         """Put everything where an episode starts; returns pose and velocity of the settled objects, [n, 13]."""
         self._start = start
         if self.cabinet is not None:
-            self.cabinet.place(np.zeros(len(self.cabinet.joints), np.float32))
+            self.cabinet.place(np.zeros(self.cabinet.dof, np.float32))
         if start.settled is None:
             self._settle(start)
         settled = self._object_states() if start.settled is None else start.settled
@@ -365,11 +369,11 @@ class Scene:
         self._restore_objects(settled)
         self.robot.place(np.asarray(start.qpos, np.float32))
         self.robot.physx.set_root_pose(pose_of(start.base_pose))
-        for joint, target in zip(self.robot.joints, start.qpos, strict=True):
-            joint.set_drive_target(float(target))
+        for i, joint in self.robot.joints.items():
+            joint.set_drive_target(float(start.qpos[i]))
             joint.set_drive_velocity_target(0.0)
         if self.cabinet is not None and start.drawer >= 0:
-            opened = np.zeros(len(self.cabinet.joints), np.float32)
+            opened = np.zeros(self.cabinet.dof, np.float32)
             opened[start.drawer] = start.opened
             self.cabinet.place(opened)
         return settled
@@ -450,11 +454,9 @@ class Scene:
     def _command(self, targets: np.ndarray, velocities: np.ndarray | None) -> list[tuple[Any, list[float]]]:
         """Set what stays the same for the whole tick; returns the rest, column by column."""
         moving = []
-        columns = [(joint.set_drive_target, targets[:, i]) for i, joint in enumerate(self.robot.joints)]
+        columns = [(joint.set_drive_target, targets[:, i]) for i, joint in self.robot.joints.items()]
         if velocities is not None:
-            columns += [
-                (joint.set_drive_velocity_target, velocities[:, i]) for i, joint in enumerate(self.robot.joints)
-            ]
+            columns += [(joint.set_drive_velocity_target, velocities[:, i]) for i, joint in self.robot.joints.items()]
         for command, values in columns:
             command(float(values[0]))
             if (values != values[0]).any():
@@ -469,7 +471,8 @@ class Scene:
         excess = targets[:, one] + targets[:, two] - total
         if (excess <= 0).all():
             return None
-        robot, columns = self.robot.physx, self.robot.order[[one, two]]
+        robot = self.robot.physx
+        columns = self.robot.order[[list(self.robot.joints).index(i) for i in (one, two)]]
         fingers = [(self.robot.joints[i], (targets[:, i] - excess / 2).tolist()) for i in (one, two)]
         pressing = [(self.robot.joints[i], targets[:, i].tolist()) for i in (one, two)]
         over = (excess > 0).tolist()
@@ -557,7 +560,7 @@ class Scene:
         rest = np.asarray(state, float)
         for articulation in (self.robot, self.cabinet):
             if articulation is not None:
-                n = len(articulation.joints)
+                n = articulation.dof
                 articulation.place(rest[:n].astype(np.float32), rest[n : 2 * n].astype(np.float32))
                 rest = rest[2 * n :]
         self._restore_objects(rest.reshape(-1, 13))

@@ -7,6 +7,7 @@ A *reference* moves from the tool towards the target, at most so far a tick, and
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,8 +73,13 @@ class Servo:
         self._reference = np.where(self._known[:, None], self._reference, tool)
         self._known[:] = True
 
-    def actions(self, targets: np.ndarray, driving: np.ndarray, facts: np.ndarray) -> np.ndarray:
-        """Actions of this tick, [B, 7]: slots in ``driving`` go towards their targets [B, 8], the others hold still."""
+    def actions(
+        self, targets: np.ndarray, driving: np.ndarray, facts: np.ndarray | Mapping[str, np.ndarray]
+    ) -> np.ndarray:
+        """Actions of this tick, [B, 7]: slots in ``driving`` go towards their targets [B, 8], the others hold still.
+
+        ``facts`` are ``tcp`` and ``base`` [B, 7] and ``qpos`` [B, N].
+        """
         reference = _towards(self._reference, targets[:, :7], self.config.max_advance_pos, self.config.max_advance_rot)
         reach = self.config.lead
         reference = _towards(

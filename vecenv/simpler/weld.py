@@ -56,38 +56,54 @@ class Frame:
 
 @dataclass(frozen=True)
 class Articulation:
-    """A welded articulation.
+    """A welded articulation with ``dof`` named joints, some of which may be frozen.
 
     Attributes:
-        physx: SAPIEN's articulation; ``order[i]`` is the index of named joint i in its qpos.
-        joints: the active joints in the order asked for.
+        physx: SAPIEN's articulation.
+        joints: column of a named joint -> the joint, without those that are frozen, in the order asked for.
+        order: index of each of ``joints`` in SAPIEN's qpos.
         frames: every link of the URDF by name.
+        frozen: angles of the frozen joints, 0 for the others, float32 [dof].
     """
 
     physx: physx.PhysxArticulation
-    joints: tuple[physx.PhysxArticulationJoint, ...]
+    joints: Mapping[int, physx.PhysxArticulationJoint]
     order: np.ndarray
     frames: Mapping[str, Frame]
+    frozen: np.ndarray
+
+    @property
+    def dof(self) -> int:
+        """How many joints have names, frozen or not."""
+        return len(self.frozen)
 
     @property
     def qpos(self) -> np.ndarray:
         """Joint positions, float32 [dof]."""
-        return self.physx.qpos[self.order]
+        out = self.frozen.copy()
+        out[self._columns] = self.physx.qpos[self.order]
+        return out
 
     @property
     def qvel(self) -> np.ndarray:
         """Joint velocities, float32 [dof]."""
-        return self.physx.qvel[self.order]
+        out = np.zeros_like(self.frozen)
+        out[self._columns] = self.physx.qvel[self.order]
+        return out
 
     def place(self, qpos: np.ndarray, qvel: np.ndarray | None = None) -> None:
-        """Set joint positions and velocities [dof] (none: at rest), and clear the joint forces."""
+        """Set joint positions and velocities [dof] (none: at rest), and clear the joint forces; frozen ones stay."""
         self.physx.set_qpos(self._unordered(qpos))
         self.physx.set_qvel(self._unordered(np.zeros_like(qpos) if qvel is None else qvel))
         self.physx.set_qf(np.zeros(len(self.order), np.float32))
 
+    @property
+    def _columns(self) -> list[int]:
+        return list(self.joints)
+
     def _unordered(self, values: np.ndarray) -> np.ndarray:
         out = np.zeros(len(self.order), np.float32)
-        out[self.order] = values
+        out[self.order] = values[self._columns]
         return out
 
 
@@ -100,6 +116,7 @@ def load(
     ignored: Mapping[str, int],
     many_hulls: bool,
     visuals: bool = False,
+    frozen: Mapping[str, float] | None = None,
 ) -> Articulation:
     """Load a URDF file with a fixed root into a scene.
 
@@ -111,23 +128,42 @@ def load(
         ignored: link name -> bit set; links that share a bit never collide.
         many_hulls: whether a collision mesh file holds several convex hulls.
         visuals: keep visual shapes (needs a renderer).
+        frozen: those of the joints that never move, and their angles (radians): they are welded too.
 
     Raises:
         ValueError: the file's active joints are not those named.
     """
+    still = dict(frozen or {})
     source = _parse(scene, urdf, surfaces, many_hulls, visuals)
+    _freeze(source.link_builders, still)
     welded, hosts = _weld(scene, source.link_builders)
     built = welded.build(fix_root_link=True, build_mimic_joints=False)
     names = [joint.name for joint in built.active_joints]
-    if sorted(names) != sorted(joints):
+    if sorted([*names, *still]) != sorted(joints):
         raise ValueError(f"{urdf.name}: active joints {', '.join(sorted(names))}; expected {', '.join(sorted(joints))}")
     bodies = {link.name: link for link in built.links}
     frames = _frames(bodies, source.link_builders, hosts)
     for name, bits in ignored.items():
         for shape in frames[name].shapes:
             shape.set_collision_groups([*shape.get_collision_groups()[:2], bits, IGNORE_ID])
-    order = np.array([names.index(name) for name in joints])
-    return Articulation(built, tuple(built.active_joints[i] for i in order), order, frames)
+    moving = {column: names.index(name) for column, name in enumerate(joints) if name not in still}
+    return Articulation(
+        physx=built,
+        joints={column: built.active_joints[i] for column, i in moving.items()},
+        order=np.array(list(moving.values())),
+        frames=frames,
+        frozen=np.array([still.get(name, 0.0) for name in joints], np.float32),
+    )
+
+
+def _freeze(links: Sequence[LinkBuilder], angles: Mapping[str, float]) -> None:
+    """Make joints fixed at their angles; SAPIEN's joints turn about the x axis of their frames."""
+    for link in links:
+        joint = link.joint_record
+        if joint.name in angles:
+            half = angles[joint.name] / 2
+            turn = sapien.Pose([0.0, 0.0, 0.0], [np.cos(half), np.sin(half), 0.0, 0.0])
+            link.joint_record = replace(joint, joint_type="fixed", pose_in_parent=joint.pose_in_parent * turn)
 
 
 def _parse(
