@@ -151,3 +151,26 @@ def test_every_tick_of_a_batch_is_a_frame_and_the_last_shows_the_verdicts(tmp_pa
     green, red = frames[-1][1, 10], frames[-1][1, -10]
     assert green[1] > green[0]
     assert red[0] > red[1]
+
+
+@pytest.mark.parametrize("option", [{"size": 64}, {"lod": "fast"}])
+def test_simplers_images_have_one_size_and_detail(option: dict[str, Any]) -> None:
+    from eval.video import _environment
+
+    with pytest.raises(ValueError, match=f"--{next(iter(option))}"):
+        _environment("simpler/bridge", "0", 1, option)
+
+
+def test_a_simpler_video_runs_at_its_robots_rate(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("PIL")
+    import imageio
+
+    from eval.video import film
+
+    env: Any = Countdown()
+    env.robot = SimpleNamespace(control_hz=5)
+    env.step_continuous = lambda _: (env.step(), SimpleNamespace(done=np.array([env.ticks >= 6] * 2)))[1]
+    actor = SimpleNamespace(reset=lambda *_: None, act=lambda _: None)
+    assert film(env, actor, tmp_path / "simpler.mp4", ["agentview"]) == 7
+    assert imageio.get_reader(tmp_path / "simpler.mp4").get_meta_data()["fps"] == 5

@@ -180,7 +180,12 @@ def _open(path: Path, fps: float) -> Any:
 
 @contextmanager
 def recording(
-    env: Any, path: str | Path, *, cameras: Sequence[str] = ("agentview",), columns: int | None = None
+    env: Any,
+    path: str | Path,
+    *,
+    cameras: Sequence[str] = ("agentview",),
+    columns: int | None = None,
+    fps: float = CONTROL_HZ,
 ) -> Iterator[VideoWriter]:
     """While inside, write what the cameras see at every control tick: all slots in one video, titled.
 
@@ -188,10 +193,11 @@ def recording(
     frame, which shows how things ended, those that are not are framed in red.
 
     Args:
-        env: a live LIBERO environment (``reset`` has been called; it is asked for the titles).
+        env: a live environment (``reset`` has been called; it is asked for the titles).
         path: the mp4.
-        cameras: shown side by side.
+        cameras: shown side by side; SIMPLER has ``agentview`` alone.
         columns: slots in a row.
+        fps: frames a second; at the robot's control rate the video runs as fast as the robot.
     """
     info = env.reset()
     titles = [f"{name}: {text}" for name, text in zip(info.episode_id, info.instruction, strict=True)]
@@ -203,7 +209,7 @@ def recording(
         verdicts = [True if one else failed for one in solved.tolist()]
         video.add(render_grid([seen.images[name] for name in cameras], titles, columns=columns, verdicts=verdicts))
 
-    with VideoWriter(path) as video:
+    with VideoWriter(path, fps) as video:
         with env.watched(lambda actions, active: shoot()):
             yield video
         shoot(failed=False)
