@@ -173,7 +173,7 @@ class RenderConfig:
         cameras: cameras besides those of the scene.
         gl: ``"egl"``, ``"osmesa"``, or None for what ``MUJOCO_GL`` says, else the first of them that works.
         engine: ``"gl"``, upstream's renderer; or ``"raytrace"``, MuJoCo Warp's, which needs no GL and is fast on NVIDIA
-            GPUs; its pictures differ a little, and it knows neither cameras of one's own nor visual options.
+            GPUs; its pictures differ a little, and of visual options it swaps no textures and colours no materials.
         num_threads: rendering threads, each with a GL context; None for one a core.
     """
 
@@ -192,8 +192,6 @@ class RenderConfig:
             raise RenderError(f"lod={self.lod!r}: expected one of {', '.join(LODS)}")
         if self.engine not in ENGINES:
             raise RenderError(f"engine={self.engine!r}: expected one of {', '.join(ENGINES)}")
-        if self.engine == "raytrace" and self.cameras:
-            raise RenderError("engine='raytrace' knows no cameras of one's own; use engine='gl'")
         if self.num_threads is not None and self.num_threads < 1:
             raise RenderError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
         names = [camera.name for camera in self.cameras]

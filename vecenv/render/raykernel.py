@@ -47,8 +47,9 @@ _MIRRORS = _PLANE, _BOX
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 # How far from a mirror its rays start, metres; and the cosine from which a box's face counts as its upper one.
 _OFF, _UPPER = wp.constant(1e-4), wp.constant(0.9)
-# Two distances, relative and in metres, that count as one; and how many faces from behind a ray may pass in a mesh.
-_NEARLY, _HARDLY, _TRIES = wp.constant(1e-6), wp.constant(1e-9), wp.constant(8)
+# Two distances, relative and in metres, that count as one; and as many faces from behind a ray may pass in a mesh (the
+# pages of a book).
+_NEARLY, _HARDLY, _TRIES = wp.constant(1e-6), wp.constant(1e-9), wp.constant(64)
 # Mirrors of a scene; further ones are dull.
 _MOST_MIRRORS = 3
 # As many panes a ray passes before it ends.
