@@ -395,6 +395,19 @@ def test_google_robot_opens_and_closes(tree: Path, gripper: str, opening: float,
     env.close()
 
 
+@pytest.mark.parametrize(("variant", "tilt"), [(None, 0.785), ({"camera": "lower"}, 0.935)])
+def test_the_head_stays_where_the_episode_has_it(small: Path, variant: dict[str, str] | None, tilt: float) -> None:
+    env = make("simpler/google_robot", task=COKE, episodes=[0], assets=small, num_workers=1, variant=variant)
+    env.reset()
+    before = env.observe_egocentric().state[0, 9:11]
+    env.step_continuous(np.tile([0.02, 0.02, -0.03, 0.1, 0.2, 0.3, 1.0], (1, 5, 1)))
+    after = env.observe_egocentric().state[0]
+    assert after[10] == pytest.approx(tilt, abs=1e-3)
+    assert after[9:11].tolist() == before.tolist()
+    assert after[20:22].tolist() == [0, 0]
+    env.close()
+
+
 def test_closed_empty_fingers_do_not_move_the_arm(tree: Path) -> None:
     env = batch(tree, COKE, [0])
     before = env.observe_egocentric().state[0, :7]

@@ -83,6 +83,31 @@ def test_turning_a_wrist_beyond_its_limit_leaves_no_room(arm: Arm) -> None:
     assert room[0] > 0 > room[1] > -2
 
 
+def test_following_a_way_tells_how_far_the_arm_gets(arm: Arm) -> None:
+    here, turn = arm.tool(QPOS, BASE)
+    steps = np.array([[[0, 0, 0.0], [0, 0.05, 0.05]], [[0, 0, 0.0], [-0.9, 0, 0.4]]])
+    room, reached = arm.follow(QPOS, BASE, here + steps, np.tile(turn, (2, 2, 1, 1)))
+    assert reached.tolist() == [2, 1]
+    assert room[0] > 0.1
+
+
+def test_drives_lag_in_a_rehearsal_as_they_do_in_physics(small: Path) -> None:
+    env = make("simpler/google_robot", task="google_robot_pick_coke_can", episodes=[0], assets=small)
+    env.reset()
+    arm = Arm(GOOGLE_ROBOT, small)
+    begin = qpos = env.observe_egocentric().state[:, :11].astype(float)
+    planned = controller(arm._coarse, small / GOOGLE_ROBOT.urdf_path(), 1)
+    planned.reset(np.ones(1, bool), qpos)
+    action = np.array([[0.0, 0.03, -0.04, 0.0, 0.1, 0.2, 0.0]])
+    for _ in range(5):
+        qpos = arm._dragged(qpos, planned.set_action(action, qpos, np.zeros_like(qpos)).position)
+        env.step_continuous(action)
+    real = env.observe_egocentric().state[0, :7]
+    assert np.abs(real - begin[0, :7]).max() > 0.1
+    np.testing.assert_allclose(qpos[0, :7], real, atol=0.01)
+    env.close()
+
+
 def test_a_box_is_held_across_its_narrow_side(arm: Arm) -> None:
     cloud = box_cloud((0.015, 0.06, 0.015), (-0.16, 0.0, 0.885))
 
