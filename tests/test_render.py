@@ -6,6 +6,7 @@ Most of it on a scene of a few boxes that compiles in a millisecond; `test_rende
 from __future__ import annotations
 
 import ctypes
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ from vecenv.libero.arenas import ARENAS
 from vecenv.libero.scene import Entity, Scene
 from vecenv.render import gl
 from vecenv.render.drawing import Pose, Stage
-from vecenv.render.gl import GlError, GlRenderer, Shot, Wanted
+from vecenv.render.gl import GlError, GlRenderer, Shot, Wanted, available, choose
 from vecenv.render.options import CameraShift, RenderConfig, RenderError, UserCamera, VisualOptions, VisualVariation
 
 XML = """
@@ -424,3 +425,21 @@ def test_hundreds_of_renderers_leak_nothing(stage: Stage) -> None:
     print(f"{warm:.1f} MB after 50 cycles, {after:.1f} MB after 350")
     # 27 kB a renderer; an image of it that stayed would be more, its context megabytes.
     assert after - warm < 8
+
+
+def test_every_other_context_in_software_gl_is_on_a_second_display() -> None:
+    if not available() or choose() != "egl":
+        pytest.skip("GL is not EGL here")
+    from mujoco import egl
+
+    from vecenv.render import displays
+
+    before = dict(os.environ)
+    contexts = [displays.egl_context(8, 8) for _ in range(2)]
+    assert dict(os.environ) == before
+    kinds = {isinstance(context, egl.GLContext) for context in contexts}
+    assert kinds == ({True, False} if displays._is_software(egl.EGL_DISPLAY) else {True})
+    for context in contexts:
+        context.make_current()
+        context.free()
+        context.free()

@@ -31,6 +31,7 @@ import numpy as np
 
 from vecenv.contract import CameraView
 from vecenv.machine import usable_cores
+from vecenv.render.displays import egl_context
 from vecenv.render.drawing import Pose, Stage, View, camera_view
 from vecenv.render.options import RenderError, UserCamera, VisualOptions
 
@@ -90,7 +91,8 @@ def open_context(gl: str, height: int, width: int) -> Any:
     """
     try:
         with _opening:
-            context = importlib.import_module(f"mujoco.{gl}").GLContext(width, height)
+            make = importlib.import_module(f"mujoco.{gl}").GLContext
+            context = egl_context(width, height) if gl == "egl" else make(width, height)
         context.make_current()
     except Exception as error:  # whatever PyOpenGL raises for this driver
         other = " or ".join(f"{_VARIABLE}={name}" for name in available() if name != gl)
