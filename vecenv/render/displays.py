@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import functools
 import itertools
 import os
 from collections.abc import Iterator
@@ -21,22 +22,17 @@ _SURFACELESS = 0x31DD  # EGL_PLATFORM_SURFACELESS_MESA
 _SOFTWARE = b"swrast"
 _THREADS = "LP_NUM_THREADS"
 _numbers = itertools.count()
-_second: list[Any] = []
 
 
 def egl_context(width: int, height: int) -> Any:
-    """A new ``mujoco.egl.GLContext``; one thread at a time may ask."""
+    """A new ``mujoco.egl.GLContext``, or one that is like it; one thread at a time may ask."""
     from mujoco import egl
 
+    second = next(_numbers) % 2 == 1
     with _shared_cores():
-        first = egl.GLContext(width, height)
-        if next(_numbers) % 2 == 0 or not _is_software(egl.EGL_DISPLAY):
-            return first
-        display = _second_display()
-    if display is None:
-        return first
-    first.free()
-    return _on(display)
+        # MuJoCo makes its display with its first context.
+        display = _second_display() if second and egl.EGL_DISPLAY is not None else None
+        return egl.GLContext(width, height) if display is None else _Context(display)
 
 
 @contextmanager
@@ -56,53 +52,48 @@ def _shared_cores() -> Iterator[None]:
         del os.environ[_THREADS]
 
 
-def _on(display: Any) -> Any:
-    """A context on a display of our own, with the methods of MuJoCo's."""
+class _Context:
+    """A context on a display of ours, with the methods of MuJoCo's."""
+
+    def __init__(self, display: Any) -> None:
+        from mujoco import egl
+        from OpenGL import EGL
+
+        self._egl, self._display, self._context = EGL, display, None
+        configs, found = (EGL.EGLConfig * 1)(), ctypes.c_long()
+        EGL.eglReleaseThread()
+        EGL.eglChooseConfig(display, egl.EGL_ATTRIBUTES, configs, 1, found)
+        EGL.eglBindAPI(EGL.EGL_OPENGL_API)
+        self._context = EGL.eglCreateContext(display, configs[0], EGL.EGL_NO_CONTEXT, None)
+        if not self._context:
+            raise RuntimeError("Cannot create an EGL context.")
+
+    def make_current(self) -> None:
+        """Of this thread."""
+        if not self._current(self._context):
+            raise RuntimeError("Failed to make the EGL context current.")
+
+    def free(self) -> None:
+        """Release it; twice is harmless."""
+        if self._context:
+            self._current(self._egl.EGL_NO_CONTEXT)
+            self._egl.eglDestroyContext(self._display, self._context)
+            self._egl.eglReleaseThread()
+        self._context = None
+
+    def _current(self, context: Any) -> Any:
+        nothing = self._egl.EGL_NO_SURFACE
+        return self._egl.eglMakeCurrent(self._display, nothing, nothing, context)
+
+
+@functools.cache
+def _second_display() -> Any:
+    """A display of Mesa's software GL besides MuJoCo's; None where MuJoCo's is no such, or there is no other."""
     from mujoco import egl
     from OpenGL import EGL
 
-    class Context:
-        """An EGL context."""
-
-        def __init__(self) -> None:
-            self._context: Any = None
-            configs, found = (EGL.EGLConfig * 1)(), ctypes.c_long()
-            EGL.eglReleaseThread()
-            EGL.eglChooseConfig(display, egl.EGL_ATTRIBUTES, configs, 1, found)
-            EGL.eglBindAPI(EGL.EGL_OPENGL_API)
-            self._context = EGL.eglCreateContext(display, configs[0], EGL.EGL_NO_CONTEXT, None)
-            if not self._context:
-                raise RuntimeError("Cannot create an EGL context.")
-
-        def make_current(self) -> None:
-            """Of this thread."""
-            if not EGL.eglMakeCurrent(display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, self._context):
-                raise RuntimeError("Failed to make the EGL context current.")
-
-        def free(self) -> None:
-            """Release it; twice is harmless."""
-            if self._context:
-                EGL.eglMakeCurrent(display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
-                EGL.eglDestroyContext(display, self._context)
-                EGL.eglReleaseThread()
-            self._context = None
-
-    return Context()
-
-
-def _second_display() -> Any:
-    """A display of Mesa's software GL besides MuJoCo's; None if there is none."""
-    if not _second:
-        _second.append(_made_display())
-    return _second[0]
-
-
-def _made_display() -> Any:
-    from OpenGL import EGL
-
-    get = ctypes.CDLL("libEGL.so.1").eglGetPlatformDisplay
-    get.restype, get.argtypes = ctypes.c_void_p, [ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p]
-    address = get(_SURFACELESS, None, None)
+    get = _procedure(b"eglGetPlatformDisplay", ctypes.c_void_p, ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p)
+    address = get(_SURFACELESS, None, None) if get is not None and _is_software(egl.EGL_DISPLAY) else None
     if not address:
         return None
     display = ctypes.cast(ctypes.c_void_p(address), EGL.EGLDisplay)
@@ -114,10 +105,16 @@ def _made_display() -> Any:
 
 def _is_software(display: Any) -> bool:
     """Whether Mesa's driver of an initialised display is its software one."""
-    library = ctypes.CDLL("libEGL.so.1")
-    library.eglGetProcAddress.restype, library.eglGetProcAddress.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
-    address = library.eglGetProcAddress(b"eglGetDisplayDriverName")
-    if not address:
-        return False
-    name = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_void_p)(address)(ctypes.cast(display, ctypes.c_void_p))
-    return name == _SOFTWARE
+    name = _procedure(b"eglGetDisplayDriverName", ctypes.c_char_p, ctypes.c_void_p)
+    return name is not None and name(ctypes.cast(display, ctypes.c_void_p)) == _SOFTWARE
+
+
+def _procedure(name: bytes, result: Any, *arguments: Any) -> Any:
+    """A function of the EGL library that PyOpenGL has loaded, by name; None if it has no such."""
+    from OpenGL import platform
+
+    library: Any = platform.PLATFORM
+    find = library.EGL["eglGetProcAddress"]  # by [], one that PyOpenGL does not share
+    find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
+    address = find(name)
+    return ctypes.CFUNCTYPE(result, *arguments)(address) if address else None
