@@ -128,7 +128,7 @@ def settle(spec: Any, ticks: int = SETTLE_TICKS) -> tuple[np.ndarray, np.ndarray
     from vecenv.physics.native import NativePhysics, Start
 
     problem, states = spec.problem(), spec.init_states()
-    scene = compile_scene(problem)
+    scene = compile_scene(problem, contacts="current")
     n, nq = len(states), scene.model.nq
     physics = NativePhysics([scene], np.zeros(n, int))
     keys = [(0, spec.suite, spec.index, episode) for episode in range(n)]
@@ -153,7 +153,7 @@ def rest(exceptions: dict[str, Any], folder: Path) -> None:
         spec = suites.task(suite, int(index))
         if "moved" not in missed:
             continue
-        model, before = compile_scene(spec.problem()).model, settled.read(folder, spec).qpos
+        model, before = compile_scene(spec.problem(), contacts="current").model, settled.read(folder, spec).qpos
         after, _ = settle(spec, SETTLE_TICKS + 50)
         for name, episodes in missed["moved"].items():
             first = int(model.joint(f"{name}_joint0").qposadr[0])
@@ -172,7 +172,7 @@ def settle_upstream(spec: Any, episode: int) -> np.ndarray:
     from vecenv.libero.env import SETTLE_ACTION
     from vecenv.libero.scene import compile_scene
 
-    scene = compile_scene(spec.problem())
+    scene = compile_scene(spec.problem(), contacts="current")
     peer = ControlEnv(str(spec.bddl_path), has_offscreen_renderer=False, use_camera_obs=False)
     peer.reset()
     model = peer.sim.model._model

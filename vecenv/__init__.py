@@ -46,6 +46,7 @@ def make(
     seed: int = 0,
     num_threads: int | None = None,
     geometry: str = "exact",
+    contacts: str = "published",
     fixtures: Any = "center",
     start: str = "settled",
     settle_steps: int = 10,
@@ -74,6 +75,8 @@ def make(
         seed: see ``fixtures``; SIMPLER's episodes depend on their number alone.
         num_threads: threads of LIBERO's native backend, worker processes of SIMPLER; None for one a core.
         geometry: LIBERO. ``"exact"``: the collision geometry of upstream. ``"lean"``: at most 24 fitted geoms a scene.
+        contacts: LIBERO. ``"published"``: those of MuJoCo 2.3 to 3.3, under which LIBERO's data and checkpoints were
+            made and scored. ``"current"``: those of the installed MuJoCo.
         fixtures: LIBERO. Where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"``
             from it (a function of seed, suite, task and episode), or name -> (pos [3] or [B, 3], quat wxyz [4] or
             [B, 4]).
@@ -107,6 +110,7 @@ def make(
         common["max_steps"] = max_steps
     libero = {
         "geometry": (geometry, "exact"),
+        "contacts": (contacts, "published"),
         "fixtures": (fixtures, "center"),
         "start": (start, "settled"),
         "settle_steps": (settle_steps, 10),

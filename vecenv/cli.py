@@ -92,6 +92,7 @@ def compile_command(
         [], "--suite", help="A LIBERO suite to export; may be given again. All by default."
     ),
     geometry: list[str] = typer.Option(["exact"], "--geometry", help="exact or lean; may be given again."),
+    contacts: str = typer.Option("published", "--contacts", help="published or current."),
 ) -> None:
     """Export LIBERO suites into one folder that needs no LIBERO or robosuite files: tasks, starts, compiled scenes."""
     from rich.console import Console
@@ -99,6 +100,7 @@ def compile_command(
 
     import vecenv
     from vecenv.libero.bddl import BDDLError
+    from vecenv.libero.contacts import CONTACTS
     from vecenv.libero.export import ExportError, export
     from vecenv.libero.geometry import PROFILES
     from vecenv.libero.scene import SceneError
@@ -111,12 +113,15 @@ def compile_command(
     for name in geometry:
         if name not in PROFILES:
             fail(unknown("geometry", name, PROFILES))
+    if contacts not in CONTACTS:
+        fail(unknown("contacts", contacts, CONTACTS))
     console = Console(stderr=True)
     try:
         done = export(
             out,
             suite or None,
             geometries=geometry,
+            contacts=contacts,  # type: ignore[arg-type]  # checked there
             track=functools.partial(track, console=console, disable=not console.is_terminal),
         )
     except ExportError as error:

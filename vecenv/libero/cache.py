@@ -34,6 +34,7 @@ import platformdirs
 from vecenv.libero import geometry
 from vecenv.libero.arenas import ARENAS
 from vecenv.libero.bddl import Problem
+from vecenv.libero.contacts import Contacts
 from vecenv.libero.scene import Entity, RegionSite, Scene, SceneSource, scene_source
 
 VARIABLE = "VECENV_CACHE_DIR"
@@ -58,7 +59,11 @@ def folder() -> Path | None:
 
 
 def cached_scene(
-    problem: Problem, *, contact_pairs: Iterable[tuple[str, str]] = (), lean_for: Iterable[Problem] | None = None
+    problem: Problem,
+    *,
+    contact_pairs: Iterable[tuple[str, str]] = (),
+    lean_for: Iterable[Problem] | None = None,
+    contacts: Contacts = "published",
 ) -> Scene:
     """The scene of a problem from the cache, or compiled and put there.
 
@@ -66,8 +71,9 @@ def cached_scene(
         problem: a parsed LIBERO problem.
         contact_pairs: as for ``compile_scene``, whose errors this raises.
         lean_for: the tasks to fit lean collision geoms for (``vecenv.libero.geometry``); None keeps upstream's.
+        contacts: as for ``compile_scene``.
     """
-    source, where = scene_source(problem, contact_pairs=contact_pairs), folder()
+    source, where = scene_source(problem, contact_pairs=contact_pairs, contacts=contacts), folder()
     asked = None if lean_for is None else geometry.demands(lean_for)
     try:
         key = None if where is None else content_key(source, asked)

@@ -34,6 +34,7 @@ from vecenv.libero import fixtures as fixture_poses
 from vecenv.libero import goals, surface
 from vecenv.libero import settled as settled_starts
 from vecenv.libero.bddl import Problem, SceneKey
+from vecenv.libero.contacts import CONTACTS, Contacts
 from vecenv.libero.export import exported_tasks
 from vecenv.libero.geometry import PROFILES
 from vecenv.libero.parts import PartSpec, opening, scene_parts
@@ -67,6 +68,8 @@ class LiberoConfig:
         backend: ``"native"`` (MuJoCo on CPU threads, float64), ``"warp"`` (MJX on MuJoCo Warp: NVIDIA GPUs, or a CPU),
             ``"jax"`` (MJX in pure JAX: any device), or ``"mjx"`` (warp on CUDA, jax elsewhere).
         geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, fitted ones (``vecenv.libero.geometry``).
+        contacts: ``"published"``, those of the MuJoCo that LIBERO's data and checkpoints come from, or ``"current"``,
+            those of the installed one (``vecenv.libero.contacts``).
         budget: contact and constraint memory on MJX; None measures the scene once and remembers it.
         fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), or name -> (pos [3] or [B, 3] in
             metres, quat wxyz [4] or [B, 4]), world frame.
@@ -84,6 +87,7 @@ class LiberoConfig:
 
     backend: str = "native"
     geometry: str = "exact"
+    contacts: Contacts = "published"
     budget: Budget | None = None
     fixtures: str | Mapping[str, Any] = "center"
     start: str = "settled"
@@ -96,7 +100,12 @@ class LiberoConfig:
     waypoint: waypoint.WaypointConfig = field(default_factory=waypoint.WaypointConfig)
 
     def __post_init__(self) -> None:
-        for name, allowed in (("backend", BACKENDS), ("geometry", PROFILES), ("start", ("settled", "raw"))):
+        for name, allowed in (
+            ("backend", BACKENDS),
+            ("geometry", PROFILES),
+            ("contacts", CONTACTS),
+            ("start", ("settled", "raw")),
+        ):
             if getattr(self, name) not in allowed:
                 raise LiberoError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
         if self.start == "settled" and self.fixtures != "center":
@@ -214,7 +223,7 @@ class LiberoEnv(SlotBatch):
         if self.config.geometry == "lean":
             everywhere = (task.problem() for task in self._sources)
             lean_for = tuple(problem for problem in everywhere if problem.scene_key() == key)
-        return self._sources[min(sharing)].scene(goals.contact_pairs(sharing.values()), lean_for)
+        return self._sources[min(sharing)].scene(goals.contact_pairs(sharing.values()), lean_for, self.config.contacts)
 
     def _budget_of(self, scene_key: SceneKey, scene: Scene) -> Budget | None:
         """Memory on MJX: as configured, or measured on the starts of all the suite's tasks in the scene."""

@@ -24,6 +24,7 @@ import numpy as np
 from vecenv.libero import goals, settled
 from vecenv.libero.bddl import Problem, SceneKey, parse_problem
 from vecenv.libero.cache import SceneFileError, compiled_source, content_key, read_scene, write_file, write_scene
+from vecenv.libero.contacts import Contacts, checked
 from vecenv.libero.geometry import PROFILES, demands
 from vecenv.libero.scene import Scene, scene_source
 from vecenv.libero.settled import SettledStarts
@@ -31,7 +32,7 @@ from vecenv.libero.suites import TaskSpec, list_suites, list_tasks
 
 INDEX, SCENES, STARTS = "index.json", "scenes", "starts"
 # Layout of the folder; raised when it changes.
-FORMAT = 2
+FORMAT = 3
 
 Track: TypeAlias = Callable[[Sequence[Any], str], Iterable[Any]]
 
@@ -63,6 +64,7 @@ def export(
     suites: Sequence[str] | None = None,
     *,
     geometries: Sequence[str] = ("exact",),
+    contacts: Contacts = "published",
     track: Track = _untracked,
 ) -> Exported:
     """Write suites into a folder; one that an earlier export wrote is brought up to date.
@@ -71,15 +73,18 @@ def export(
         out: the folder, created if need be.
         suites: which; all of them by default.
         geometries: profiles of the collision geoms, see ``vecenv.libero.geometry``.
+        contacts: those of the exported scenes, see ``vecenv.libero.contacts``.
         track: called with a list of what is to be done and a word for it, returns it to iterate over: where a progress
             bar goes.
 
     Raises:
         ExportError: ``out`` is a file, or a folder that holds something else.
+        ContactsError: other contacts.
         UnknownSuite, AssetsMissing, TaskDataError, BDDLError, SceneError, SettledStartsError: what is to be exported is
             not there or not in order.
         OSError: the folder cannot be written.
     """
+    checked(contacts)
     folder = _writable(Path(out))
     tasks = {suite: list_tasks(suite) for suite in dict.fromkeys(list_suites() if suites is None else suites)}
     sharing: dict[SceneKey, list[Problem]] = {}
@@ -89,11 +94,13 @@ def export(
         in_suite.setdefault((suite, problem.scene_key()), []).append(problem)
     wanted = [(suite, key, profile) for suite, key in in_suite for profile in dict.fromkeys(geometries)]
     ids = {
-        (suite, key, profile): _write_scene(folder, sharing[key], in_suite[suite, key] if profile == "lean" else None)
+        (suite, key, profile): _write_scene(
+            folder, sharing[key], in_suite[suite, key] if profile == "lean" else None, contacts
+        )
         for suite, key, profile in track(wanted, "scenes")
     }
     entries = {suite: _write_suite(folder, tasks[suite], ids) for suite in track(list(tasks), "starts")}
-    index = {"format": FORMAT, "mujoco": mujoco.__version__, "suites": entries}
+    index = {"format": FORMAT, "mujoco": mujoco.__version__, "contacts": contacts, "suites": entries}
     write_file(folder / INDEX, json.dumps(index, indent=1).encode())
     return Exported(
         folder=folder,
@@ -121,9 +128,11 @@ def _files(folder: Path, suites: Iterable[str], ids: Iterable[str]) -> list[Path
     return [folder / INDEX, *scenes, *(folder / STARTS / f"{suite}.npz" for suite in suites)]
 
 
-def _write_scene(folder: Path, problems: Sequence[Problem], lean_for: Sequence[Problem] | None) -> str:
+def _write_scene(
+    folder: Path, problems: Sequence[Problem], lean_for: Sequence[Problem] | None, contacts: Contacts
+) -> str:
     """Write the scene these problems share, with lean geoms for some of them or upstream's; returns its id."""
-    source = scene_source(problems[0], contact_pairs=goals.contact_pairs(problems))
+    source = scene_source(problems[0], contact_pairs=goals.contact_pairs(problems), contacts=contacts)
     asked = None if lean_for is None else demands(lean_for)
     key = content_key(source, asked)
     try:
@@ -201,17 +210,27 @@ class ExportedTask:
         arrays = self.folder.starts(self.suite)
         return SettledStarts(arrays[f"qpos_{self.index}"], arrays[f"qvel_{self.index}"])
 
-    def scene(self, contact_pairs: tuple[tuple[str, str], ...], lean_for: tuple[Problem, ...] | None = None) -> Scene:
+    def scene(
+        self,
+        contact_pairs: tuple[tuple[str, str], ...],
+        lean_for: tuple[Problem, ...] | None = None,
+        contacts: Contacts = "published",
+    ) -> Scene:
         """The compiled scene; it has the contact sensors of every exported task.
 
         Raises:
-            ExportError: the scene is damaged, or was not exported with this geometry.
+            ExportError: the scene is damaged, or was not exported with this geometry or these contacts.
         """
         profile = "exact" if lean_for is None else "lean"
         if profile not in self.scene_ids:
             raise ExportError(
                 f"{self.folder.path}: holds no {profile} scenes of {self.suite}; "
                 f"run `vecenv compile --out {self.folder.path} --geometry {profile}` again"
+            )
+        if contacts != self.folder.contacts:
+            raise ExportError(
+                f"{self.folder.path}: exported with contacts={self.folder.contacts!r}, asked for {contacts!r}; use "
+                f"that, or `vecenv compile --out DIR --contacts {contacts}` for a new folder"
             )
         return self.folder.scene(self.scene_ids[profile])
 
@@ -289,6 +308,7 @@ class ExportFolder:
         try:
             index = json.loads(data)
             self._check_versions(index["format"], index["mujoco"])
+            self.contacts = checked(index["contacts"])
             return {
                 suite: (str(entry["starts"]), self._tasks(suite, entry)) for suite, entry in index["suites"].items()
             }

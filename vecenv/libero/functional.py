@@ -37,6 +37,7 @@ from vecenv.libero import fixtures as fixture_poses
 from vecenv.libero import goals
 from vecenv.libero import settled as settled_starts
 from vecenv.libero.bddl import Problem
+from vecenv.libero.contacts import CONTACTS, Contacts
 from vecenv.libero.export import exported_tasks
 from vecenv.libero.geometry import PROFILES
 from vecenv.libero.objectives import OBJECTIVES, Objective, View
@@ -80,6 +81,7 @@ class FunctionalConfig:
     Attributes:
         impl: ``"warp"``, ``"jax"``, or None: warp where JAX runs on CUDA and jax elsewhere.
         geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, at most 24 fitted ones.
+        contacts: ``"published"``, those of the MuJoCo that LIBERO comes from, or ``"current"``.
         scenes: a folder that ``vecenv compile`` wrote, in place of the installed packages.
         budget: contact and constraint memory of a world; None measures the scene once and remembers it.
         iterations: solver iterations and line-search steps a substep at most; None for those of ``vecenv.make``.
@@ -108,6 +110,7 @@ class FunctionalConfig:
 
     impl: str | None = None
     geometry: str = "exact"
+    contacts: Contacts = "published"
     scenes: str | None = None
     budget: Budget | None = None
     iterations: tuple[int, int] | None = None
@@ -129,6 +132,7 @@ class FunctionalConfig:
     def __post_init__(self) -> None:
         options = {
             "geometry": PROFILES,
+            "contacts": CONTACTS,
             "cone": tuple(CONES),
             "action": tuple(ACTIONS),
             "reward": REWARDS,
@@ -429,7 +433,7 @@ class LiberoEnv:
         source, problem = sources[task], sources[task].problem()
         self.instruction = source.instruction
         sharing = _sharing(sources, problem)
-        self.scene = _with_cone(_scene(source, sharing, self.config.geometry), CONES[self.config.cone])
+        self.scene = _with_cone(_scene(source, sharing, self.config), CONES[self.config.cone])
         budget = self.config.budget or _measured(self.scene, sharing)
         iterations = self.config.iterations or mjx_physics.usual_iterations(self.config.impl, self.config.geometry)
         built = mjx_physics.build(self.scene, impl=self.config.impl, budget=budget, iterations=iterations)
@@ -597,9 +601,9 @@ def _sharing(sources: Sequence[Task], problem: Problem) -> list[Task]:
     return [task for task in sources if task.problem().scene_key() == problem.scene_key()]
 
 
-def _scene(source: Task, sharing: Sequence[Task], profile: str) -> Scene:
-    lean_for = tuple(task.problem() for task in sharing) if profile == "lean" else None
-    return source.scene(goals.contact_pairs([source.problem()]), lean_for)
+def _scene(source: Task, sharing: Sequence[Task], config: FunctionalConfig) -> Scene:
+    lean_for = tuple(task.problem() for task in sharing) if config.geometry == "lean" else None
+    return source.scene(goals.contact_pairs([source.problem()]), lean_for, config.contacts)
 
 
 def _with_cone(scene: Scene, cone: mujoco.mjtCone) -> Scene:

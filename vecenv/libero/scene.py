@@ -18,9 +18,10 @@ import mujoco
 import numpy as np
 
 from vecenv import assets
-from vecenv.libero import catalog, mjcf
+from vecenv.libero import catalog, contacts, mjcf
 from vecenv.libero.arenas import ARENAS, Arena
 from vecenv.libero.bddl import Problem, Region
+from vecenv.libero.contacts import Contacts
 
 # Robot pose at reset, radians (robosuite's Panda as LIBERO mounts it).
 HOME_QPOS = np.array([0.0, -1.61037389e-01, 0.0, -2.44459747, 0.0, 2.22675220, np.pi / 4])
@@ -108,6 +109,11 @@ class Scene:
     entities: Mapping[str, Entity]
     regions: Mapping[str, RegionSite]
 
+    @property
+    def contacts(self) -> Contacts:
+        """Which contacts its physics has; see ``vecenv.libero.contacts``."""
+        return contacts.of(self.model)
+
     @cached_property
     def arm_qpos(self) -> np.ndarray:
         """Addresses of the seven arm joints in qpos, int [7]."""
@@ -188,10 +194,15 @@ def contact_sensor_name(first: str, second: str) -> str:
 
 
 def scene_source(
-    problem: Problem, *, contact_pairs: Iterable[tuple[str, str]] = (), visual: bool = False
+    problem: Problem,
+    *,
+    contact_pairs: Iterable[tuple[str, str]] = (),
+    visual: bool = False,
+    contacts: Contacts = "published",
 ) -> SceneSource:
     """Put the MJCF of a problem together; arguments and errors as for ``compile_scene``."""
     builder = _Builder(problem)
+    _choose_contacts(builder.root, contacts)
     builder.add_contact_sensors(contact_pairs)
     if not visual:
         mjcf.remove_visuals(builder.root)
@@ -205,19 +216,27 @@ def scene_source(
     )
 
 
-def compile_scene(problem: Problem, *, contact_pairs: Iterable[tuple[str, str]] = (), visual: bool = False) -> Scene:
+def compile_scene(
+    problem: Problem,
+    *,
+    contact_pairs: Iterable[tuple[str, str]] = (),
+    visual: bool = False,
+    contacts: Contacts = "published",
+) -> Scene:
     """Build the model of a problem.
 
     Args:
         problem: a parsed LIBERO problem.
         contact_pairs: pairs of objects and fixtures whose contacts goals ask for; each becomes a contact sensor.
         visual: keep visual geoms, materials and textures. The physics does not depend on it.
+        contacts: ``"published"``, those of the MuJoCo that LIBERO was made with, or ``"current"``.
 
     Raises:
         SceneError: unknown problem class or object category, an asset that breaks the conventions, or a model that
             MuJoCo refuses.
+        ContactsError: other contacts.
     """
-    return scene_source(problem, contact_pairs=contact_pairs, visual=visual).compile()
+    return scene_source(problem, contact_pairs=contact_pairs, visual=visual, contacts=contacts).compile()
 
 
 class _Builder:
@@ -372,6 +391,20 @@ def _vec3(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
+def _choose_contacts(root: ET.Element, chosen: Contacts) -> None:
+    """Write the choice of contacts into an MJCF tree; errors of ``contacts.checked``."""
+    if contacts.checked(chosen) == "current":
+        return
+    numeric = root.find(f"custom/numeric[@name='{contacts.NUMERIC}']")
+    option = root.find("option")
+    assert numeric is not None
+    assert option is not None
+    numeric.set("data", repr(contacts.MARK))
+    for name, value in contacts.OPTIONS[chosen].items():
+        option.set(name, repr(value))
+    ET.SubElement(option, "flag", {"multiccd": "disable"})
+
+
 def _base() -> ET.Element:
     """The options every robosuite 1.4.0 scene is compiled with."""
     root = ET.Element("mujoco", {"model": "libero"})
@@ -385,6 +418,7 @@ def _base() -> ET.Element:
     visual = ET.SubElement(root, "visual")
     ET.SubElement(visual, "map", {"znear": "0.001"})
     custom = ET.SubElement(root, "custom")
+    ET.SubElement(custom, "numeric", {"name": contacts.NUMERIC, "data": "0"})
     for name in (CONTACT_LIMIT, PAIR_LIMIT):
         ET.SubElement(custom, "numeric", {"name": name, "data": "-1"})
     for tag in ("asset", "worldbody", "actuator", "sensor"):

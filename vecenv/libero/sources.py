@@ -15,6 +15,7 @@ import numpy as np
 from vecenv.libero import settled
 from vecenv.libero.bddl import Problem
 from vecenv.libero.cache import cached_scene
+from vecenv.libero.contacts import Contacts
 from vecenv.libero.scene import Scene
 from vecenv.libero.settled import SettledStarts
 from vecenv.libero.suites import TaskSpec, list_tasks
@@ -45,7 +46,12 @@ class Task(Protocol):
         """The init states at rest."""
         ...
 
-    def scene(self, contact_pairs: tuple[tuple[str, str], ...], lean_for: tuple[Problem, ...] | None = None) -> Scene:
+    def scene(
+        self,
+        contact_pairs: tuple[tuple[str, str], ...],
+        lean_for: tuple[Problem, ...] | None = None,
+        contacts: Contacts = "published",
+    ) -> Scene:
         """The compiled scene, the same object whenever it is the same.
 
         Tasks of one ``problem().scene_key()`` share a scene.
@@ -53,6 +59,7 @@ class Task(Protocol):
         Args:
             contact_pairs: things whose contacts its sensors count; it may have more.
             lean_for: all tasks of the suite that share it, to fit lean collision geoms for; None keeps upstream's.
+            contacts: ``"published"`` or ``"current"``, see ``vecenv.libero.contacts``.
         """
         ...
 
@@ -85,9 +92,14 @@ class InstalledTask:
         """See `Task`."""
         return settled.load(self.spec)
 
-    def scene(self, contact_pairs: tuple[tuple[str, str], ...], lean_for: tuple[Problem, ...] | None = None) -> Scene:
+    def scene(
+        self,
+        contact_pairs: tuple[tuple[str, str], ...],
+        lean_for: tuple[Problem, ...] | None = None,
+        contacts: Contacts = "published",
+    ) -> Scene:
         """See `Task`."""
-        return compiled(self.problem(), contact_pairs, lean_for)
+        return compiled(self.problem(), contact_pairs, lean_for, contacts)
 
 
 def installed_tasks(suite: str) -> tuple[InstalledTask, ...]:
@@ -97,7 +109,10 @@ def installed_tasks(suite: str) -> tuple[InstalledTask, ...]:
 
 @functools.lru_cache(maxsize=64)
 def compiled(
-    problem: Problem, contact_pairs: tuple[tuple[str, str], ...], lean_for: tuple[Problem, ...] | None = None
+    problem: Problem,
+    contact_pairs: tuple[tuple[str, str], ...],
+    lean_for: tuple[Problem, ...] | None = None,
+    contacts: Contacts = "published",
 ) -> Scene:
     """A problem's scene, the same object for the same arguments."""
-    return cached_scene(problem, contact_pairs=contact_pairs, lean_for=lean_for)
+    return cached_scene(problem, contact_pairs=contact_pairs, lean_for=lean_for, contacts=contacts)

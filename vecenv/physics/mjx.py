@@ -28,7 +28,7 @@ from mujoco import mjx
 from vecenv.controllers import gripper as gripper_control
 from vecenv.controllers import kinematics, osc, waypoint
 from vecenv.controllers.rotations import quat_to_mat
-from vecenv.libero import cache, goals
+from vecenv.libero import cache, contacts, goals
 from vecenv.libero.scene import HOME_QPOS, Scene
 from vecenv.physics import budgets, newton
 from vecenv.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Followed, Physics, Ran, Start, Watcher
@@ -40,6 +40,7 @@ Impl: TypeAlias = Literal["jax", "warp"]
 _ROBOT = 9
 # Gripper targets after a quarter of a second of the action -1.
 _OPEN = (1.0, -1.0)
+_TOLERANCES = ("tolerance", "ls_tolerance")
 # Velocities from here on are what MuJoCo's mj_checkVel calls unstable.
 _HUGE = mujoco.mjMAXVAL
 
@@ -216,6 +217,8 @@ def build(
         raise MjxError("the scene's integrator must be Euler")
     model = budget.limited(scene.model)
     model.opt.iterations, model.opt.ls_iterations = iterations or usual_iterations(chosen, "exact")
+    # Single precision never gets as close as published contacts ask of native physics.
+    model.opt.tolerance, model.opt.ls_tolerance = (contacts.OPTIONS["current"][name] for name in _TOLERANCES)
     touching = _without_contact_sensors(model) if chosen == "jax" else None
     put = mjx.put_model(model, impl=chosen)
     if chosen == "warp":

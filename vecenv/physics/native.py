@@ -33,6 +33,7 @@ from mujoco.batch import Batch, SimulationError
 from vecenv.controllers.osc_numba import ArmViews, Controllers
 from vecenv.libero.scene import ARM_JOINTS, HOME_QPOS, Scene
 from vecenv.machine import usable_cores
+from vecenv.physics import collider
 from vecenv.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Physics, Start
 
 # Slots a thread steps at a time. Eight simulations stay in a core's cache; fewer spend more on calls.
@@ -337,10 +338,15 @@ class NativePhysics(Physics):
         scenes: distinct scenes.
         scene_of_slot: index into ``scenes`` of each slot, int [B].
         num_threads: threads; None for one a core.
+
+    Raises:
+        ColliderError: the scenes have published contacts, and this MuJoCo cannot be taught them.
     """
 
     def __init__(self, scenes: Sequence[Scene], scene_of_slot: np.ndarray, num_threads: int | None = None) -> None:
         self.num_envs = len(scene_of_slot)
+        if any(scene.contacts == "published" for scene in scenes):
+            collider.install()
         self._workers = Workers(num_threads)
         block = _block_size(self.num_envs, self._workers.threads)
         used = [(scene, np.flatnonzero(scene_of_slot == index)) for index, scene in enumerate(scenes)]
