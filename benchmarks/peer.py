@@ -1,8 +1,9 @@
 """Upstream's side of a comparison: rollouts of LIBERO under the MuJoCo of another Python environment.
 
 Run as a process by the benchmarks that compare (``trajectories.py``), with the Python of the peer's environment: that
-of ``make upstream`` (MuJoCo 3.3.0) or the one that vecenv itself runs in. In: a JSON file of jobs, each a suite, a
+of ``make upstream`` (MuJoCo 3.3.0) or the one that vecenv itself runs in. In: jobs, each a suite, a
 task, an episode and by how much to nudge the start or the actions. Out: one ``.npz`` file with the rollout of each job.
+It also judges states that are handed to it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -95,21 +96,71 @@ def actions_of(job: Job) -> np.ndarray:
 
 
 def rollouts(jobs: Sequence[Job], python: str | Path = sys.executable) -> Iterator[Rollout]:
-    """The rollouts of these jobs, made by another Python.
+    """The rollouts of these jobs, made by another Python; errors of ``_ask``."""
+    asked = {"jobs": np.array(json.dumps([asdict(job) for job in jobs]))}
+    made = _ask("rollouts", asked, python)
+    for number in range(len(jobs)):
+        yield Rollout(**{name: made[f"{number}/{name}"] for name in Rollout.__dataclass_fields__})
+
+
+def verdicts(
+    suite: str,
+    task: int,
+    states: np.ndarray,
+    fixtures: tuple[np.ndarray, np.ndarray, np.ndarray],
+    python: str | Path = sys.executable,
+) -> np.ndarray:
+    """Upstream's verdicts on states [n, nq] of a task, bool [n], by another Python; errors of ``_ask``.
+
+    Args:
+        suite, task: the task.
+        states: joint positions.
+        fixtures: ids of fixtures' bodies [F], positions in metres [F, 3], orientations wxyz [F, 4].
+        python: the peer's.
+    """
+    arrays = dict(zip(("bodies", "pos", "quat"), fixtures, strict=True))
+    asked = {"suite": np.array(suite), "task": np.array(task), "states": states, **arrays}
+    return _ask("verdicts", asked, python)["verdicts"]
+
+
+def _ask(question: str, arrays: Mapping[str, np.ndarray], python: str | Path) -> dict[str, np.ndarray]:
+    """Let another Python answer.
 
     Raises:
         RuntimeError: the process failed; the message holds the end of what it printed.
     """
     with tempfile.TemporaryDirectory() as folder:
-        asked, made = Path(folder) / "jobs.json", Path(folder) / "rollouts.npz"
-        asked.write_text(json.dumps([asdict(job) for job in jobs]))
-        command = [str(python), __file__, str(asked), str(made)]
+        asked, made = Path(folder) / "asked.npz", Path(folder) / "made.npz"
+        np.savez_compressed(asked, **arrays)  # type: ignore[arg-type]
+        command = [str(python), __file__, question, str(asked), str(made)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
         with np.load(made, allow_pickle=False) as file:
-            for number in range(len(jobs)):
-                yield Rollout(**{name: file[f"{number}/{name}"] for name in Rollout.__dataclass_fields__})
+            return {name: file[name] for name in file.files}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--contacts`` and ``--peer``, which every comparison with upstream takes."""
+    parser.add_argument("--contacts", choices=("published", "current"), default="published", help="ours")
+    parser.add_argument(
+        "--peer",
+        metavar="PYTHON",
+        help="upstream's Python; that of `make upstream` (MuJoCo 3.3.0) for published contacts, else this one",
+    )
+
+
+def python_of(options: argparse.Namespace) -> str:
+    """The peer's Python as chosen on the command line.
+
+    Raises:
+        SystemExit: it is not there; says how to make it.
+    """
+    default = ROOT / ".venv-upstream" / "bin" / "python" if options.contacts == "published" else sys.executable
+    chosen = Path(options.peer or default)
+    if not chosen.is_file():
+        raise SystemExit(f"{chosen}: no such file; `make upstream` makes the environment, or name one with --peer")
+    return str(chosen)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -162,18 +213,41 @@ def run(job: Job) -> Rollout:
     )
 
 
-def main() -> None:
-    """Run the jobs of a file."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("jobs", type=Path)
-    parser.add_argument("out", type=Path)
-    options = parser.parse_args()
-    sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+def _rollouts(asked: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
-    for number, job in enumerate(json.loads(options.jobs.read_text())):
+    for number, job in enumerate(json.loads(str(asked["jobs"]))):
         rollout = run(Job(**job))
         arrays |= {f"{number}/{name}": getattr(rollout, name) for name in Rollout.__dataclass_fields__}
-    np.savez_compressed(options.out, **arrays)  # type: ignore[arg-type]
+    return arrays
+
+
+def _verdicts(asked: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    import upstream
+
+    from vecenv.libero import suites
+
+    spec = suites.task(str(asked["suite"]), int(asked["task"]))
+    peer = upstream.peer_of(spec.bddl_path)
+    upstream.set_fixtures(peer, asked["bodies"].tolist(), asked["pos"], asked["quat"])
+    found, goal = [], spec.problem().goal
+    for state in asked["states"]:
+        upstream.set_state(peer, state, np.zeros(upstream.model_of(peer).nv))
+        found.append(upstream.verdict(peer, goal))
+    return {"verdicts": np.array(found, bool)}
+
+
+def main() -> None:
+    """Answer one question."""
+    answers = {"rollouts": _rollouts, "verdicts": _verdicts}
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("question", choices=answers)
+    parser.add_argument("asked", type=Path)
+    parser.add_argument("made", type=Path)
+    options = parser.parse_args()
+    sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+    with np.load(options.asked, allow_pickle=False) as file:
+        arrays = answers[options.question]({name: file[name] for name in file.files})
+    np.savez_compressed(options.made, **arrays)  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":

@@ -1,141 +1,110 @@
 """Trajectories against upstream: the same starts, fixture poses and actions, 60 control steps, all 32 scenes.
 
-Both sides run under the installed MuJoCo from the stored start (no settling in advance). Actions are piecewise constant
+Published contacts are held against upstream under MuJoCo 3.3.0 (`make upstream`), current ones against upstream under
+the installed MuJoCo; both sides begin at the stored start, without settling in advance. Actions are piecewise constant
 at random, some without rotation, with gripper flips. A row is a task: the largest difference of joint positions before
-the robot's first contact with anything and after it, of the 8-D proprioception, and whether all verdicts agreed.
-Where contact amplifies rounding beyond 1e-3, a last column says how far upstream diverges from itself when one joint
-starts 1e-15 rad away.
+the robot's first contact with anything and after it, of the 8-D proprioception, and whether all verdicts agreed. Where
+contact amplifies differences beyond 1e-3, two last columns say how far upstream diverges from itself when one joint
+starts 1e-15 rad away (the largest of seven tries), and when every action that is not zero is 1e-15 larger.
+
+    make upstream && python benchmarks/trajectories.py
+    python benchmarks/trajectories.py --contacts current
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import peer
 from common import report
+from peer import Job, Rollout
 
 import vecenv
 from vecenv.libero.env import LiberoEnv
-from vecenv.libero.suites import TaskSpec
 
-TICKS = 60
-SETTLE = 10
 # Above this, upstream is run against itself from a start 1e-15 rad away, to tell chaos from error.
 BOUND = 1e-3
+NUDGE = 1e-15
 
 
-def random_actions(seed: int, ticks: int) -> np.ndarray:
-    """Settling ticks, then piecewise constant actions with gripper flips, [ticks, 7]."""
-    rng = np.random.default_rng(seed)
-    actions = [np.array([0, 0, 0, 0, 0, 0, -1.0])] * SETTLE
-    while len(actions) < ticks:
-        action = rng.uniform(-1, 1, 7)
-        action[2] = rng.uniform(-1, 0.2)  # mostly down, so that the hand meets things
-        action[3:6] *= rng.random() < 0.7
-        action[6] = rng.choice([-1.0, 1.0])
-        actions += [action] * int(rng.integers(1, 8))
-    return np.array(actions[:ticks])
-
-
-def robot_touches(model: Any, data: Any) -> bool:
-    """Whether a geom of the robot's moving parts touches anything that is not the robot."""
-    names = [model.body(model.geom_bodyid[g]).name for g in range(model.ngeom)]
-    robot = np.array([name.startswith(("robot0", "gripper0")) for name in names])
-    pairs = data.contact.geom[: data.ncon]
-    return bool((robot[pairs[:, 0]] != robot[pairs[:, 1]]).any()) if len(pairs) else False
-
-
-def compare(spec: TaskSpec, episode: int) -> dict[str, Any]:
+def compare(job: Job, theirs: Rollout, contacts: str) -> dict[str, Any]:
     """One row."""
-    import upstream
-
-    peer = upstream.bare_peer(spec.bddl_path)
-    peer.seed(episode)
-    with upstream.silence():
-        peer.reset()
-    model, data = upstream.model_of(peer), upstream.data_of(peer)
-    bodies = {name: model.body(fixture.root_body) for name, fixture in peer.env.fixtures_dict.items()}
-    fixtures = {name: (body.pos.copy(), body.quat.copy()) for name, body in bodies.items()}
-    peer.set_init_state(spec.init_states()[episode])
-    env = vecenv.make(spec.suite, task=spec.index, episodes=[episode], fixtures=fixtures, start="raw", settle_steps=0)
+    poses = zip(theirs.fixtures.tolist(), theirs.fixture_pos, theirs.fixture_quat, strict=True)
+    env = vecenv.make(
+        job.suite,
+        task=job.task,
+        episodes=[job.episode],
+        fixtures={name: (pos, quat) for name, pos, quat in poses},
+        start="raw",
+        settle_steps=0,
+        contacts=contacts,
+    )
     assert isinstance(env, LiberoEnv)
     env.reset()
-    touched, first, before, after, state, agree = False, "never", 0.0, 0.0, 0.0, True
-    for tick, action in enumerate(random_actions(episode, TICKS)):
-        observation, _, done, _ = peer.step(action)
+    apart, state, agree, solved = np.zeros(len(theirs.qpos)), 0.0, True, False
+    for tick, action in enumerate(theirs.actions):
         control = env.step_continuous(action[None])
-        difference = float(np.abs(env.state().qpos[0] - data.qpos).max())
-        if not touched and robot_touches(model, data):
-            touched, first = True, str(tick)
-        before, after = (before, max(after, difference)) if touched else (max(before, difference), after)
-        theirs = np.concatenate(
-            [
-                observation["robot0_eef_pos"],
-                upstream.rotation_vector(observation["robot0_eef_quat"]),
-                observation["robot0_gripper_qpos"],
-            ]
-        )
-        state = max(state, float(np.abs(env.observe_egocentric().state[0] - theirs.astype(np.float32)).max()))
-        agree &= bool(control.success[0]) == bool(done)
+        apart[tick] = np.abs(env.state().qpos[0] - theirs.qpos[tick]).max()
+        seen = env.observe_egocentric().state[0]
+        state = max(state, float(np.abs(seen - theirs.state[tick].astype(np.float32)).max()))
+        agree &= solved or bool(control.success[0]) == bool(theirs.success[tick])
+        solved |= bool(control.success[0])  # ours stands still from there on
     env.close()
     return {
-        "task": f"{spec.suite}/{spec.index}",
-        "episode": episode,
-        "first contact": first,
-        "max |dq| before": before,
-        "max |dq| after": after,
+        "task": f"{job.suite}/{job.task}",
+        "episode": job.episode,
+        "first contact": str(int(theirs.touched.argmax())) if theirs.touched.any() else "never",
+        "max |dq| before": float(apart[~theirs.touched].max(initial=0)),
+        "max |dq| after": float(apart[theirs.touched].max(initial=0)),
         "max |d state|": state,
         "verdicts agree": str(agree),
     }
 
 
-def sensitivity(spec: TaskSpec, episode: int) -> float:
-    """How far upstream strays from itself when one arm joint starts 1e-15 rad away: largest |dq| of seven tries."""
-    exact = _upstream_states(spec, episode, np.zeros(7))
-    return max(float(np.abs(_upstream_states(spec, episode, row) - exact).max()) for row in 1e-15 * np.eye(7))
-
-
-def _upstream_states(spec: TaskSpec, episode: int, nudge: np.ndarray) -> np.ndarray:
-    """Joint positions after each tick, [TICKS, nq], from a start whose arm is moved by ``nudge`` [7]."""
-    import upstream
-
-    peer = upstream.bare_peer(spec.bddl_path)
-    peer.seed(episode)
-    with upstream.silence():
-        peer.reset()
-    start = spec.init_states()[episode].copy()
-    start[1:8] += nudge
-    peer.set_init_state(start)
-    rows = []
-    for action in random_actions(episode, TICKS):
-        peer.step(action)
-        rows.append(upstream.data_of(peer).qpos.copy())
-    return np.array(rows)
+def twins(job: Job, theirs: Rollout, python: str) -> tuple[float, float]:
+    """How far upstream strays from itself: started 1e-15 rad away (largest of seven joints), acting 1e-15 apart."""
+    nudged = [replace(job, joint=joint, start_nudge=NUDGE) for joint in range(7)]
+    found = peer.rollouts([*nudged, replace(job, action_nudge=NUDGE)], python)
+    apart = [float(np.abs(rollout.qpos - theirs.qpos).max()) for rollout in found]
+    return max(apart[:7]), apart[7]
 
 
 def main() -> None:
     """Compare one task of every scene, and two of those that several tasks share."""
     import upstream
 
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=32, help="how many scenes")
-    scenes = list(upstream.scene_tasks().values())[: parser.parse_args().scenes]
+    peer.add_arguments(parser)
+    options = parser.parse_args()
+    python = peer.python_of(options)
+    scenes = list(upstream.scene_tasks().values())[: options.scenes]
     specs = [spec for tasks in scenes for spec in {tasks[0].name: tasks[0], tasks[-1].name: tasks[-1]}.values()]
-    rows = []
-    for number, spec in enumerate(specs):
-        rows.append(compare(spec, episode=number % 50))
-        rows[-1]["upstream nudged 1e-15"] = sensitivity(spec, number % 50) if rows[-1]["max |dq| after"] > BOUND else ""
-        print(rows[-1], flush=True)
+    jobs = [Job(suite=spec.suite, task=spec.index, episode=number % 50) for number, spec in enumerate(specs)]
+    rows, version = [], ""
+    for job, theirs in zip(jobs, peer.rollouts(jobs, python), strict=True):
+        row, version = compare(job, theirs, options.contacts), str(theirs.mujoco)
+        amplified = max(row["max |dq| before"], row["max |dq| after"]) > BOUND
+        row["start nudged 1e-15"], row["actions nudged 1e-15"] = twins(job, theirs, python) if amplified else ("", "")
+        rows.append(row)
+        print(row, flush=True)
+    before, after = (np.array([row[f"max |dq| {when}"] for row in rows]) for when in ("before", "after"))
     report(
-        "trajectories",
+        "trajectories" if options.contacts == "published" else "trajectories_current",
         rows,
-        title=f"{len(rows)} tasks of {len(scenes)} scenes, {TICKS} control steps, against upstream",
+        title=f"{len(rows)} tasks of {len(scenes)} scenes, {peer.TICKS} control steps, {options.contacts} contacts "
+        f"against upstream under MuJoCo {version}",
         notes={
+            "contacts": options.contacts,
+            "peer": f"MuJoCo {version}",
             "tasks": len(rows),
             "scenes": len(scenes),
-            "worst before contact": max(row["max |dq| before"] for row in rows),
-            "worst after contact": max(row["max |dq| after"] for row in rows),
+            "worst before contact": float(before.max()),
+            "worst after contact": float(after.max()),
+            "tasks above 1e-3": int((np.maximum(before, after) > BOUND).sum()),
             "worst state": max(row["max |d state|"] for row in rows),
         },
     )

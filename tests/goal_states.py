@@ -18,6 +18,7 @@ import numpy as np
 from vecenv.libero import goals
 from vecenv.libero.bddl import Predicate, Problem
 from vecenv.libero.scene import Scene
+from vecenv.physics import collider
 
 STEPS = (1e-7, 1e-4, 1e-2)
 _BOTH_SIDES = [sign * step for sign in (-1.0, 1.0) for step in STEPS]
@@ -29,6 +30,8 @@ class Simulation:
     """One state of a scene, with the poses of its fixtures: what goals read of it."""
 
     def __init__(self, scene: Scene) -> None:
+        if scene.contacts == "published":
+            collider.install()
         self.scene = scene
         self.model = copy.copy(scene.model)
         self.data = mujoco.MjData(self.model)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import upstream
 
+from vecenv.libero import contacts, suites
 from vecenv.libero import scene as scenes
-from vecenv.libero import suites
 from vecenv.libero.arenas import ARENAS
 from vecenv.libero.bddl import Problem, parse_problem
 from vecenv.libero.fixtures import placements
@@ -53,7 +53,7 @@ COUNTS = ("nq", "nv", "nu", "na", "njnt", "nbody", "nsite", "ncam", "neq", "nten
 
 @functools.cache
 def scene_of(scene_id: str) -> Scene:
-    return compile_scene(upstream.tasks_of(scene_id)[0].problem())
+    return compile_scene(upstream.tasks_of(scene_id)[0].problem(), contacts="current")
 
 
 def names(model: mujoco.MjModel, kind: mujoco.mjtObj, ids: Sequence[int]) -> list[str | None]:
@@ -138,6 +138,17 @@ def assert_looks_the_same(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> None:
 def test_the_130_tasks_share_32_scenes() -> None:
     assert len(upstream.scene_tasks()) == 32
     assert sum(map(len, upstream.scene_tasks().values())) == 130
+
+
+def test_published_contacts_are_solver_options_and_a_mark() -> None:
+    problem = upstream.tasks_of("libero_object-0")[0].problem()
+    published, current = compile_scene(problem), compile_scene(problem, contacts="current")
+    assert (published.contacts, current.contacts) == ("published", "current")
+    contacts.mark(published.model, "current")
+    assert_same_options(published.model, current.model)
+    np.testing.assert_array_equal(published.model.numeric_data, current.model.numeric_data)
+    contacts.mark(current.model, "published")
+    assert_same_options(current.model, compile_scene(problem).model)
 
 
 @pytest.mark.parametrize("scene_id", upstream.scene_ids())
@@ -308,7 +319,9 @@ def test_a_new_task_in_any_workspace_equals_upstreams_model(problem_name: str, t
     path = tmp_path / "task.bddl"
     path.write_text(upstream.task_text(problem_name))
     problem = parse_problem(path.read_text(), str(path))
-    assert_same_physics(problem, compile_scene(problem), upstream.model_of(upstream.bare_peer(path)))
+    assert_same_physics(
+        problem, compile_scene(problem, contacts="current"), upstream.model_of(upstream.bare_peer(path))
+    )
 
 
 @pytest.mark.parametrize(
@@ -342,4 +355,8 @@ def test_scenes_of_the_pro_suites_equal_upstreams_models(suite: str) -> None:
         problem = task.problem()
         if problem.scene_key() not in known:
             known.add(problem.scene_key())
-            assert_same_physics(problem, compile_scene(problem), upstream.model_of(upstream.bare_peer(task.bddl_path)))
+            assert_same_physics(
+                problem,
+                compile_scene(problem, contacts="current"),
+                upstream.model_of(upstream.bare_peer(task.bddl_path)),
+            )

@@ -80,8 +80,8 @@ def make(
         fixtures: LIBERO. Where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"``
             from it (a function of seed, suite, task and episode), or name -> (pos [3] or [B, 3], quat wxyz [4] or
             [B, 4]).
-        start: LIBERO. ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them (fixtures at the centre);
-            ``"raw"``: init states as stored, followed by ``settle_steps``.
+        start: LIBERO. ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them; ``"raw"``: init states as
+            stored, followed by ``settle_steps``.
         settle_steps: LIBERO, for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
         num_devices: LIBERO. Devices that MJX spreads the slots over.
         budget: LIBERO. Contact and constraint memory on MJX; None measures each scene once and remembers it.

@@ -31,7 +31,7 @@ from vecenv.contract import (
 )
 from vecenv.controllers import waypoint
 from vecenv.libero import fixtures as fixture_poses
-from vecenv.libero import goals, surface
+from vecenv.libero import goals, settling, surface
 from vecenv.libero import settled as settled_starts
 from vecenv.libero.bddl import Problem, SceneKey
 from vecenv.libero.contacts import CONTACTS, Contacts
@@ -42,15 +42,13 @@ from vecenv.libero.scene import Scene
 from vecenv.libero.sources import Task, installed_tasks
 from vecenv.libero.suites import NUM_EPISODES
 from vecenv.physics import budgets
-from vecenv.physics.base import Group, Physics, Start
+from vecenv.physics.base import SETTLE_ACTION, SETTLE_TICKS, Group, Physics, Start
 from vecenv.physics.budgets import Budget
 from vecenv.physics.build import BACKENDS, make_physics
 from vecenv.render.eyes import Eyes, options_of
 from vecenv.render.options import RenderConfig, VisualOptions
 from vecenv.slots import SlotBatch
 
-# What LIBERO evaluations send while objects settle after a reset: no motion, gripper open.
-SETTLE_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 MAX_STEPS = 2500
 # Starts of a scene on which its memory on MJX is measured.
 _BUDGET_STARTS = 64
@@ -73,8 +71,9 @@ class LiberoConfig:
         budget: contact and constraint memory on MJX; None measures the scene once and remembers it.
         fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), or name -> (pos [3] or [B, 3] in
             metres, quat wxyz [4] or [B, 4]), world frame.
-        start: ``"settled"``, the stored init states after ten idle ticks under MuJoCo 3.3.0, shipped with the package,
-            with fixtures at the centre; or ``"raw"``, the stored init states followed by ``settle_steps``.
+        start: ``"settled"``, the stored init states after ten idle ticks: under MuJoCo 3.3.0, shipped with the package,
+            for fixtures at the centre; settled here, once, for fixtures elsewhere (``vecenv.libero.settling``). Or
+            ``"raw"``, the stored init states followed by ``settle_steps``.
         settle_steps: for ``start="raw"``: control ticks with no motion and an opening gripper before an episode begins;
             they do not count.
         max_steps: step budget of an episode in control ticks.
@@ -91,7 +90,7 @@ class LiberoConfig:
     budget: Budget | None = None
     fixtures: str | Mapping[str, Any] = "center"
     start: str = "settled"
-    settle_steps: int = 10
+    settle_steps: int = SETTLE_TICKS
     max_steps: int = MAX_STEPS
     seed: int = 0
     num_threads: int | None = None
@@ -108,10 +107,6 @@ class LiberoConfig:
         ):
             if getattr(self, name) not in allowed:
                 raise LiberoError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
-        if self.start == "settled" and self.fixtures != "center":
-            raise LiberoError(
-                "fixtures other than 'center' need start='raw': what lies on fixtures settled at the centre"
-            )
         if self.settle_steps < 0 or self.max_steps < 1:
             raise LiberoError(f"settle_steps={self.settle_steps}, max_steps={self.max_steps}: need >= 0 and >= 1")
         if self.num_threads is not None and self.num_threads < 1:
@@ -292,8 +287,8 @@ class LiberoEnv(SlotBatch):
             keys=[(self.config.seed, self.suite, task, int(episode)) for episode in episodes],
             slots=slots.tolist(),
         )
-        settled = self.config.start == "settled"
-        return Start(
+        settled = self.config.start == "settled" and self.config.fixtures == "center"
+        start = Start(
             qpos=qpos[episodes],
             qvel=qvel[episodes],
             bodies=bodies,
@@ -302,10 +297,19 @@ class LiberoEnv(SlotBatch):
             time=settled_starts.TIME if settled else 0.0,
             settled=settled,
         )
+        if settled or self.config.start == "raw":
+            return start
+        return settling.at_rest(self._settling_scene(data, scene), start)
+
+    def _settling_scene(self, data: _TaskData, scene: Scene) -> Scene:
+        """The scene that starts settle in: upstream's geometry, published contacts."""
+        if self.config.geometry == "exact" and self.config.contacts == "published":
+            return scene
+        return data.source.scene(goals.contact_pairs([data.problem]))
 
     def _stored(self, data: _TaskData) -> tuple[np.ndarray, np.ndarray]:
         """Positions [50, nq] and velocities [50, nv] of a task's starts."""
-        if self.config.start == "settled":
+        if self.config.start == "settled" and self.config.fixtures == "center":
             starts = data.source.settled()
             return starts.qpos, starts.qvel
         states, free_joints = data.source.init_states(), len(data.problem.objects)

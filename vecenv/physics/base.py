@@ -26,6 +26,10 @@ SUBSTEPS = 25
 OBSERVED_POSE = 23
 OBSERVED_FINGERS = 24
 
+# What LIBERO evaluations send while objects settle after a reset (no motion, gripper open), and for how many ticks.
+SETTLE_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+SETTLE_TICKS = 10
+
 Watcher = Callable[[np.ndarray, np.ndarray], None]
 
 
