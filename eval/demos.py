@@ -45,9 +45,9 @@ _MAX_TEXT = 1 << 25
 
 _NAME = re.compile(r"demo_?(\d+)")
 # The options of ``vecenv.make`` that decide where an episode begins and how it goes; no path is among them.
-_OPTIONS = frozenset({"backend", "geometry", "fixtures", "start", "settle_steps", "max_steps", "seed"})
+_OPTIONS = frozenset({"backend", "geometry", "fixtures", "reset_loop", "start", "settle_steps", "max_steps", "seed"})
 # Types of those that do not have the type of their default alone.
-_KINDS = {"fixtures": (str, dict), "max_steps": (int,)}
+_KINDS = {"fixtures": (str, dict), "reset_loop": (dict,), "max_steps": (int,)}
 # What h5py and NumPy raise over a file that is damaged or holds something else.
 _DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError)
 

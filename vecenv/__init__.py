@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from vecenv.contract import BatchEnv
     from vecenv.physics.budgets import Budget
+    from vecenv.protocols import ResetLoop
     from vecenv.render.options import RenderConfig
     from vecenv.simpler.variants import Variant
 
@@ -48,6 +49,7 @@ def make(
     geometry: str = "exact",
     contacts: str = "published",
     fixtures: Any = "center",
+    reset_loop: ResetLoop | Mapping[str, Any] | None = None,
     start: str = "settled",
     settle_steps: int = 10,
     num_devices: int = 1,
@@ -78,8 +80,11 @@ def make(
         contacts: LIBERO. ``"published"``: those of MuJoCo 2.3 to 3.3, under which LIBERO's data and checkpoints were
             made and scored. ``"current"``: those of the installed MuJoCo.
         fixtures: LIBERO. Where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"``
-            from it (a function of seed, suite, task and episode), or name -> (pos [3] or [B, 3], quat wxyz [4] or
-            [B, 4]).
+            from it (a function of seed, suite, task and episode), ``"upstream"``: where upstream's ``env.seed(seed)``
+            and the resets of an evaluation script put them, or name -> (pos [3] or [B, 3], quat wxyz [4] or [B, 4]).
+        reset_loop: LIBERO, for ``fixtures="upstream"``: how that script seeds and resets, a
+            ``vecenv.protocols.ResetLoop`` or a mapping of its fields; seeded once a task, one reset an episode by
+            default.
         start: LIBERO. ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them; ``"raw"``: init states as
             stored, followed by ``settle_steps``.
         settle_steps: LIBERO, for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
@@ -112,6 +117,7 @@ def make(
         "geometry": (geometry, "exact"),
         "contacts": (contacts, "published"),
         "fixtures": (fixtures, "center"),
+        "reset_loop": (reset_loop, None),
         "start": (start, "settled"),
         "settle_steps": (settle_steps, 10),
         "num_devices": (num_devices, 1),

@@ -45,6 +45,7 @@ from vecenv.physics import budgets
 from vecenv.physics.base import SETTLE_ACTION, SETTLE_TICKS, Group, Physics, Start
 from vecenv.physics.budgets import Budget
 from vecenv.physics.build import BACKENDS, make_physics
+from vecenv.protocols import ResetLoop, reset_loop
 from vecenv.render.eyes import Eyes, options_of
 from vecenv.render.options import RenderConfig, VisualOptions
 from vecenv.slots import SlotBatch
@@ -69,15 +70,17 @@ class LiberoConfig:
         contacts: ``"published"``, those of the MuJoCo that LIBERO's data and checkpoints come from, or ``"current"``,
             those of the installed one (``vecenv.libero.contacts``).
         budget: contact and constraint memory on MJX; None measures the scene once and remembers it.
-        fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), or name -> (pos [3] or [B, 3] in
-            metres, quat wxyz [4] or [B, 4]), world frame.
+        fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), ``"upstream"`` (as upstream draws them
+            in ``reset_loop``), or name -> (pos [3] or [B, 3] in metres, quat wxyz [4] or [B, 4]), world frame.
         start: ``"settled"``, the stored init states after ten idle ticks: under MuJoCo 3.3.0, shipped with the package,
             for fixtures at the centre; settled here, once, for fixtures elsewhere (``vecenv.libero.settling``). Or
             ``"raw"``, the stored init states followed by ``settle_steps``.
         settle_steps: for ``start="raw"``: control ticks with no motion and an opening gripper before an episode begins;
             they do not count.
         max_steps: step budget of an episode in control ticks.
-        seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode.
+        seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode; and for ``"upstream"``,
+            what an evaluation script gives to ``env.seed``.
+        reset_loop: how that script seeds and resets, for ``fixtures="upstream"``; also a mapping of its fields.
         num_threads: threads of the native backend; None for one a core.
         num_devices: GPUs (or other devices) that MJX spreads the slots over.
         render: size of camera images, level of detail, cameras of one's own.
@@ -93,6 +96,7 @@ class LiberoConfig:
     settle_steps: int = SETTLE_TICKS
     max_steps: int = MAX_STEPS
     seed: int = 0
+    reset_loop: ResetLoop | Mapping[str, Any] = field(default_factory=ResetLoop)
     num_threads: int | None = None
     num_devices: int = 1
     render: RenderConfig = field(default_factory=RenderConfig)
@@ -107,10 +111,19 @@ class LiberoConfig:
         ):
             if getattr(self, name) not in allowed:
                 raise LiberoError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
+        object.__setattr__(self, "reset_loop", reset_loop(self.reset_loop))
+        if self.fixtures == "upstream":
+            self.loop.at(self.seed, 0, 0)  # a seed that upstream does not take is refused before anything is built
         if self.settle_steps < 0 or self.max_steps < 1:
             raise LiberoError(f"settle_steps={self.settle_steps}, max_steps={self.max_steps}: need >= 0 and >= 1")
         if self.num_threads is not None and self.num_threads < 1:
             raise LiberoError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
+
+    @property
+    def loop(self) -> ResetLoop:
+        """``reset_loop`` as what it became."""
+        assert isinstance(self.reset_loop, ResetLoop)
+        return self.reset_loop
 
 
 def _joined(starts: Sequence[Start]) -> Start:
@@ -286,6 +299,7 @@ class LiberoEnv(SlotBatch):
             self.config.fixtures,
             keys=[(self.config.seed, self.suite, task, int(episode)) for episode in episodes],
             slots=slots.tolist(),
+            loop=self.config.loop,
         )
         settled = self.config.start == "settled" and self.config.fixtures == "center"
         start = Start(
