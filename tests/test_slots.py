@@ -28,7 +28,7 @@ class Scripted(SlotBatch):
         super().__init__("suite", num_envs)
         self.armed: list[list[int]] = []
         self.failures: dict[int, str] = {}
-        self._place(placing.cross(range(num_envs), 0, num_tasks=num_envs, num_episodes=50))
+        self._place(placing.cross(range(num_envs), [0], num_tasks=num_envs, num_episodes=50))
 
     def tick(self, success: tuple[int, ...] = (), fail: Mapping[int, str] | None = None) -> Control:
         """One tick of all slots that are not done."""

@@ -19,6 +19,8 @@ import numpy as np
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv.contract import (
+    FIRST,
+    SUCCESS_MODES,
     Control,
     Egocentric,
     Objects,
@@ -45,7 +47,7 @@ from vecenv.physics import budgets
 from vecenv.physics.base import SETTLE_ACTION, SETTLE_TICKS, Group, Physics, Start
 from vecenv.physics.budgets import Budget
 from vecenv.physics.build import BACKENDS, make_physics
-from vecenv.protocols import ResetLoop, reset_loop
+from vecenv.protocols import DEFAULT, Protocol, ResetLoop, reset_loop
 from vecenv.render.eyes import Eyes, options_of
 from vecenv.render.options import RenderConfig, VisualOptions
 from vecenv.slots import SlotBatch
@@ -64,6 +66,7 @@ class LiberoConfig:
     """Options of a LIBERO batch.
 
     Attributes:
+        protocol: name of the evaluation protocol that the options come from, for the record; it decides nothing here.
         backend: ``"native"`` (MuJoCo on CPU threads, float64), ``"warp"`` (MJX on MuJoCo Warp: NVIDIA GPUs, or a CPU),
             ``"jax"`` (MJX in pure JAX: any device), or ``"mjx"`` (warp on CUDA, jax elsewhere).
         geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, fitted ones (``vecenv.libero.geometry``).
@@ -78,6 +81,8 @@ class LiberoConfig:
         settle_steps: for ``start="raw"``: control ticks with no motion and an opening gripper before an episode begins;
             they do not count.
         max_steps: step budget of an episode in control ticks.
+        success: ``"first"``: an episode ends when its goal first holds; ``"final"``: at the end of its budget, where
+            the verdict is read.
         seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode; and for ``"upstream"``,
             what an evaluation script gives to ``env.seed``.
         reset_loop: how that script seeds and resets, for ``fixtures="upstream"``; also a mapping of its fields.
@@ -87,6 +92,7 @@ class LiberoConfig:
         waypoint: tolerances and speeds of ``step_ee_pose``.
     """
 
+    protocol: str = DEFAULT
     backend: str = "native"
     geometry: str = "exact"
     contacts: Contacts = "published"
@@ -95,6 +101,7 @@ class LiberoConfig:
     start: str = "settled"
     settle_steps: int = SETTLE_TICKS
     max_steps: int = MAX_STEPS
+    success: str = FIRST
     seed: int = 0
     reset_loop: ResetLoop | Mapping[str, Any] = field(default_factory=ResetLoop)
     num_threads: int | None = None
@@ -108,6 +115,7 @@ class LiberoConfig:
             ("geometry", PROFILES),
             ("contacts", CONTACTS),
             ("start", ("settled", "raw")),
+            ("success", SUCCESS_MODES),
         ):
             if getattr(self, name) not in allowed:
                 raise LiberoError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
@@ -170,7 +178,7 @@ class LiberoEnv(SlotBatch):
     _error = LiberoError
 
     def __init__(self, suite: str, tasks: Sequence[Task], placement: placing.Placement, config: LiberoConfig) -> None:
-        super().__init__(suite, len(placement))
+        super().__init__(suite, len(placement), success=config.success)
         self.config = config
         self._sources = tasks
         self._physics: Physics | None = None
@@ -197,7 +205,8 @@ class LiberoEnv(SlotBatch):
 
     def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
         counts = {"num_tasks": len(self._sources), "num_episodes": NUM_EPISODES}
-        return placing.each(tasks, episodes, self._placement, **counts)
+        indices = None if tasks is None else placing.task_indices(tasks, [source.name for source in self._sources])
+        return placing.each(indices, episodes, self._placement, **counts)
 
     def _prepare(self) -> np.ndarray:
         """Scenes, physics and goal tables for the current placement; what still fits is kept."""
@@ -356,8 +365,9 @@ class LiberoEnv(SlotBatch):
         self._check_live()
         chunk, mended = action_space.continuous(actions, self.num_envs)
         before = self._steps.copy()
-        ran = self.physics.run(chunk, ~self._done, self._ticks_left, self._watchers)
-        return self._control(Control, self._book(ran.ticks, ran.success), before, mended)
+        until = self._until_success
+        ran = self.physics.run(chunk, ~self._done, self._ticks_left, self._watchers, until_success=until)
+        return self._control(Control, self._book(ran.ticks, ran.success, ran.solved), before, mended)
 
     @property
     def _ticks_left(self) -> np.ndarray:
@@ -380,8 +390,10 @@ class LiberoEnv(SlotBatch):
             self.config.waypoint,
             max_misses=max_misses,
             watchers=self._watchers,
+            until_success=self._until_success,
         )
-        return self._book(followed.ticks, followed.success), followed.converged, followed.waypoint_ticks
+        reward = self._book(followed.ticks, followed.success, followed.solved)
+        return reward, followed.converged, followed.waypoint_ticks
 
     def _tools(self) -> np.ndarray:
         return np.concatenate(self.physics.eef(), axis=1)
@@ -682,17 +694,25 @@ def make(
     tasks: Any = None,
     episodes: Any = None,
     scenes: str | Path | None = None,
+    protocol: Protocol,
     **options: Any,
 ) -> LiberoEnv:
-    """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments."""
+    """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments.
+
+    Args:
+        protocol: says how many episodes there are and how large images are, where that is not given.
+    """
     sources = installed_tasks(suite) if scenes is None else exported_tasks(scenes, suite)
     if task is not None and tasks is not None:
         raise LiberoError("give task or tasks, not both")
-    chosen = tasks if task is None else task
+    names = [source.name for source in sources]
     placement = placing.cross(
-        range(len(sources)) if chosen is None else chosen,
-        range(NUM_EPISODES) if episodes is None else episodes,
+        placing.task_indices(tasks if task is None else task, names),
+        episodes,
         num_tasks=len(sources),
         num_episodes=NUM_EPISODES,
+        every=protocol.episodes,
     )
-    return LiberoEnv(suite, sources, placement, LiberoConfig(**options))
+    if "render" not in options and protocol.image_size is not None:
+        options["render"] = RenderConfig(height=protocol.image_size, width=protocol.image_size)
+    return LiberoEnv(suite, sources, placement, LiberoConfig(protocol=protocol.name, **options))
