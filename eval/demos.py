@@ -525,7 +525,8 @@ def _shape(shape: Sequence[int] | None) -> str:
 
 def make_options(make: Callable[..., Any], **arguments: Any) -> dict[str, Any]:
     """What ``make(**arguments)`` says about how episodes begin and go, with what defaults and the protocol leave it."""
-    bound = inspect.signature(make).bind_partial(**arguments)
+    signature = inspect.signature(make)
+    bound = signature.bind_partial(**arguments)
     bound.apply_defaults()
     given = {name: value for name, value in bound.arguments.items() if value is not None}
     chosen = protocols.protocol(given.get("protocol", protocols.DEFAULT))
@@ -533,7 +534,7 @@ def make_options(make: Callable[..., Any], **arguments: Any) -> dict[str, Any]:
     options["reset_loop"] = asdict(protocols.reset_loop(options["reset_loop"]))
     if options["fixtures"] != "upstream":
         del options["reset_loop"]
-    return {name: value for name, value in options.items() if name in _OPTIONS}
+    return {name: value for name, value in options.items() if name in _OPTIONS & signature.parameters.keys()}
 
 
 def write_demos(path: Path, suite: str, task: int, instruction: str, recordings: Sequence[Recording]) -> None:
