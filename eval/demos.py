@@ -47,7 +47,10 @@ _MAX_TEXT = 1 << 25
 _NAME = re.compile(r"demo_?(\d+)")
 # The options of ``vecenv.make`` that decide where an episode begins and how it goes; no path is among them.
 _OPTIONS = frozenset(
-    {"backend", "geometry", "fixtures", "reset_loop", "start", "settle_steps", "max_steps", "success", "seed"}
+    {
+        *("backend", "geometry", "contacts", "fixtures", "reset_loop", "start", "settle_steps", "max_steps"),
+        *("success", "seed"),
+    }
 )
 # Types of those whose default does not say it.
 _KINDS = {
