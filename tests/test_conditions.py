@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -94,8 +95,8 @@ def test_every_report_names_them(tmp_path: Path) -> None:
 
 def test_both_verdicts_are_reported_where_they_differ() -> None:
     def record(episode: int, first: bool, final: bool) -> Record:
-        verdict = {"success": final, "success_first": first, "success_final": final}
-        return Record(suite="s", task=0, episode=episode, instruction="i", num_steps=3, reward=1.0, **verdict)
+        told = Record(suite="s", task=0, episode=episode, instruction="i", success=final, num_steps=3, reward=1.0)
+        return replace(told, success_first=first, success_final=final)
 
     records = [record(0, True, True), record(1, True, False), record(2, False, False)]
     summary = summarise(records, [r.key for r in records], suite="s", policy="p", instructions=["i"])

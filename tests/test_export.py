@@ -80,7 +80,7 @@ def copy(exported: Path, tmp_path: Path) -> Path:
 
 
 def make(folder: Path, suite: str = "libero_goal", **options: Any) -> LiberoEnv:
-    env = vecenv.make(suite, **{"task": 0, "episodes": 0, "scenes": folder, **options})
+    env = vecenv.make(suite, **{"task": 0, "episodes": [0], "scenes": folder, **options})
     assert isinstance(env, LiberoEnv)
     return env
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
+from vecenv import protocols
 from vecenv.contract import (
     FIRST,
     SUCCESS_MODES,
@@ -694,14 +695,16 @@ def make(
     tasks: Any = None,
     episodes: Any = None,
     scenes: str | Path | None = None,
-    protocol: Protocol,
+    protocol: Protocol | None = None,
     **options: Any,
 ) -> LiberoEnv:
     """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments.
 
     Args:
-        protocol: says how many episodes there are and how large images are, where that is not given.
+        protocol: says how many episodes there are and how large images are, where that is not given; this project's
+            own when left out.
     """
+    protocol = protocol or protocols.protocol(DEFAULT)
     sources = installed_tasks(suite) if scenes is None else exported_tasks(scenes, suite)
     if task is not None and tasks is not None:
         raise LiberoError("give task or tasks, not both")
