@@ -163,7 +163,7 @@ def environment(group: MjxGroup, start: World | None = None) -> Callable[[], Any
     def run() -> Any:
         assert group.table is not None
         worlds = group.worlds if start is None else jax.tree.map(jnp.copy, start)
-        loop = group.compiled.run(group.system, group.table, worlds, chunk, active, limit)
+        loop = group.compiled.run(True)(group.system, group.table, worlds, chunk, active, limit)
         group.replace(loop.worlds)
         return loop.ticks
 

@@ -44,13 +44,18 @@ def eval_command(
         show_default="the suite's scripted one",
     ),
     tasks: str | None = typer.Option(None, help="all, or indices, ranges and names: 0,3,5-7.", show_default="all"),
-    episodes: str | None = typer.Option(None, help="all, a count, or indices and ranges: 0,3,5-7.", show_default="all"),
+    episodes: str | None = typer.Option(
+        None, help="all (the protocol's), a count, or indices and ranges: 0,3,5-7.", show_default="all"
+    ),
     policy_arg: list[str] | None = typer.Option(
         None, help="key=value for the policy; repeatable.", show_default="none"
     ),
+    protocol: str | None = typer.Option(
+        None, help="Evaluation protocol; `vecenv list --protocols` has them.", show_default="seed"
+    ),
     backend: str | None = typer.Option(None, help="Physics backend.", show_default="native"),
-    max_steps: int | None = typer.Option(None, min=1, help="Step budget of an episode.", show_default="the suite's"),
-    seed: int | None = typer.Option(None, help="Seed of environment and policy.", show_default="0"),
+    max_steps: int | None = typer.Option(None, min=1, help="Step budget of an episode.", show_default="the protocol's"),
+    seed: int | None = typer.Option(None, help="Seed of environment and policy.", show_default="the protocol's"),
     env_arg: list[str] | None = typer.Option(None, help="key=value for vecenv.make; repeatable.", show_default="none"),
     num_envs: int | None = typer.Option(
         None, min=1, help="Most episodes that run at once.", show_default="the suite's"
@@ -74,6 +79,7 @@ def eval_command(
         "tasks": tasks,
         "episodes": episodes,
         "policy_args": _pairs("--policy-arg", policy_arg),
+        "protocol": protocol,
         "backend": backend,
         "max_steps": max_steps,
         "seed": seed,

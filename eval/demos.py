@@ -21,7 +21,7 @@ import re
 import shutil
 import xml.parsers.expat
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ import h5py
 import numpy as np
 
 import vecenv
+from vecenv import protocols
 from vecenv.assets import AssetsMissing
 from vecenv.contract import ACTION_DIM
 from vecenv.libero.arenas import ARENAS
@@ -45,9 +46,22 @@ _MAX_TEXT = 1 << 25
 
 _NAME = re.compile(r"demo_?(\d+)")
 # The options of ``vecenv.make`` that decide where an episode begins and how it goes; no path is among them.
-_OPTIONS = frozenset({"backend", "geometry", "fixtures", "start", "settle_steps", "max_steps", "seed"})
-# Types of those that do not have the type of their default alone.
-_KINDS = {"fixtures": (str, dict), "max_steps": (int,)}
+_OPTIONS = frozenset(
+    {
+        *("backend", "geometry", "contacts", "fixtures", "reset_loop", "start", "settle_steps", "max_steps"),
+        *("success", "seed"),
+    }
+)
+# Types of those whose default does not say it.
+_KINDS = {
+    "fixtures": (str, dict),
+    "reset_loop": (dict,),
+    "start": (str,),
+    "settle_steps": (int,),
+    "max_steps": (int,),
+    "success": (str,),
+    "seed": (int,),
+}
 # What h5py and NumPy raise over a file that is damaged or holds something else.
 _DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError)
 
@@ -513,10 +527,17 @@ def _shape(shape: Sequence[int] | None) -> str:
 
 
 def make_options(make: Callable[..., Any], **arguments: Any) -> dict[str, Any]:
-    """What ``make(**arguments)`` says about how episodes begin and go, its defaults included (but not ``None``)."""
-    bound = inspect.signature(make).bind_partial(**arguments)
+    """What ``make(**arguments)`` says about how episodes begin and go, with what defaults and the protocol leave it."""
+    signature = inspect.signature(make)
+    bound = signature.bind_partial(**arguments)
     bound.apply_defaults()
-    return {name: value for name, value in bound.arguments.items() if name in _OPTIONS and value is not None}
+    given = {name: value for name, value in bound.arguments.items() if value is not None}
+    chosen = protocols.protocol(given.get("protocol", protocols.DEFAULT))
+    options = {**chosen.options(given.get("suite", "")), **given}
+    options["reset_loop"] = asdict(protocols.reset_loop(options["reset_loop"]))
+    if options["fixtures"] != "upstream":
+        del options["reset_loop"]
+    return {name: value for name, value in options.items() if name in _OPTIONS & signature.parameters.keys()}
 
 
 def write_demos(path: Path, suite: str, task: int, instruction: str, recordings: Sequence[Recording]) -> None:

@@ -6,18 +6,16 @@ episodes, at most ``num_envs`` slots each, tasks that share a scene side by side
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Collection, Hashable, Iterator, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise, product
 
-ALL = "all"
+from vecenv.placement import ALL, SpecError, parse_episodes, parse_tasks
+
+__all__ = ["ALL", "MAX_SLOTS", "Batch", "Episode", "SpecError", "Suite", "parse_episodes", "parse_tasks", "plan"]
+
 # Most episodes that run at once, where neither the user nor the suite says otherwise.
 MAX_SLOTS = 256
-
-
-class SpecError(ValueError):
-    """A specification of tasks or episodes cannot be read, or asks for something that does not exist."""
 
 
 @dataclass(frozen=True, order=True)
@@ -48,7 +46,8 @@ class Suite:
         name: name of the suite.
         instructions: language instruction of each task.
         scenes: what each task needs built; tasks with equal entries share it.
-        num_episodes: episodes of each task.
+        num_episodes: episodes that can be run, of each task or task by task (0 where there are none).
+        every: those that ``"all"`` runs, likewise; None for all that can be run.
         tasks: name of each task, by which it may be asked for; may be empty.
         max_slots: most episodes to run at once unless told otherwise.
     """
@@ -56,9 +55,14 @@ class Suite:
     name: str
     instructions: tuple[str, ...]
     scenes: tuple[Hashable, ...]
-    num_episodes: int
+    num_episodes: int | tuple[int, ...]
+    every: int | None = None
     tasks: tuple[str, ...] = ()
     max_slots: int = MAX_SLOTS
+
+    def episodes_of(self, task: int) -> int:
+        """How many episodes of a task can be run."""
+        return self.num_episodes if isinstance(self.num_episodes, int) else self.num_episodes[task]
 
 
 @dataclass(frozen=True)
@@ -84,42 +88,10 @@ class Batch:
         return len(self.tasks) * len(self.episodes)
 
 
-def parse_tasks(spec: str, num_tasks: int, names: Sequence[str] = ()) -> tuple[int, ...]:
-    """Read task indices: ``"all"``, or indices, ranges and names such as ``"0,3,5-7,widowx_stack_cube"``.
-
-    Args:
-        spec: the text.
-        num_tasks: how many tasks the suite has.
-        names: what they are called.
-
-    Raises:
-        SpecError: the text cannot be read, or names a task the suite does not have.
-    """
-    return tuple(range(num_tasks)) if spec.strip() == ALL else _parse_indices(spec, num_tasks, "task", names)
-
-
-def parse_episodes(spec: str, num_episodes: int) -> tuple[int, ...]:
-    """Read episode indices: ``"all"``, a bare number for that many from the first on, or a list as for tasks.
-
-    ``"5"`` means episodes 0 to 4; the single episode 5 is ``"5-5"`` or ``"5,"``.
-
-    Raises:
-        SpecError: the text cannot be read, or asks for episodes the task does not have.
-    """
-    text = spec.strip()
-    if text == ALL:
-        return tuple(range(num_episodes))
-    if not text.isdecimal():
-        return _parse_indices(text, num_episodes, "episode")
-    if not 1 <= int(text) <= num_episodes:
-        raise SpecError(f"{text} episodes asked for: each task has {num_episodes}, ask for 1 to {num_episodes}")
-    return tuple(range(int(text)))
-
-
 def plan(
     suite: Suite,
     tasks: Sequence[int],
-    episodes: Sequence[int],
+    episodes: Sequence[int] | Mapping[int, Sequence[int]],
     *,
     num_envs: int,
     done: Collection[Episode] = (),
@@ -129,14 +101,15 @@ def plan(
     Args:
         suite: the suite, for which tasks share a scene.
         tasks: task indices; in the plan they are ordered by scene.
-        episodes: episode indices.
+        episodes: episode indices, for all tasks or by task.
         num_envs: most slots in a batch.
         done: episodes to leave out.
     """
     if num_envs < 1:
         raise SpecError(f"num_envs must be at least 1, not {num_envs}")
     done = frozenset(done)
-    todo = [(t, tuple(e for e in episodes if Episode(suite.name, t, e) not in done)) for t in _by_scene(suite, tasks)]
+    wanted = episodes if isinstance(episodes, Mapping) else dict.fromkeys(tasks, episodes)
+    todo = [(t, tuple(e for e in wanted[t] if Episode(suite.name, t, e) not in done)) for t in _by_scene(suite, tasks)]
     batches = []
     for missing, group in groupby(todo, key=lambda row: row[1]):
         if missing:
@@ -164,29 +137,3 @@ def _even_chunks(items: Sequence[int], most: int) -> Iterator[tuple[int, ...]]:
     bounds = [len(items) * i // count for i in range(count + 1)]
     for start, stop in pairwise(bounds):
         yield tuple(items[start:stop])
-
-
-def _parse_indices(spec: str, count: int, what: str, names: Sequence[str] = ()) -> tuple[int, ...]:
-    parts = [part.strip() for part in spec.split(",") if part.strip()]
-    if not parts:
-        raise SpecError(f"no {what} named in {spec!r}")
-    indices = [index for part in parts for index in _parse_part(part, count, what, names)]
-    return tuple(dict.fromkeys(indices))
-
-
-def _parse_part(part: str, count: int, what: str, names: Sequence[str]) -> Sequence[int]:
-    return (names.index(part),) if part in names else _parse_range(part, count, what, names)
-
-
-def _parse_range(part: str, count: int, what: str, names: Sequence[str]) -> range:
-    low, dash, high = part.partition("-")
-    if not low.strip().isdecimal() or (dash and not high.strip().isdecimal()):
-        near = difflib.get_close_matches(part, names, n=3)
-        close = f"; did you mean {', '.join(near)}?" if near else ""
-        raise SpecError(f"cannot read {part!r} as {what}s: write indices and ranges such as 0,3,5-7, or 'all'{close}")
-    start, stop = int(low), int(high) if dash else int(low)
-    if stop < start:
-        raise SpecError(f"the range {part!r} of {what}s runs backwards")
-    if stop >= count:
-        raise SpecError(f"there is no {what} {stop}: the last one is {count - 1}")
-    return range(start, stop + 1)

@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.stats import binomtest
 
+from eval.conditions import describe
 from eval.episodes import Episode
 from eval.store import Record
 
@@ -38,7 +39,8 @@ class Row:
         task: task index, or ``"all"``.
         instruction: its language instruction.
         episodes: episodes with a verdict, faulted ones included.
-        successes: those that were solved.
+        successes: those that were solved, in the sense of the protocol.
+        first, final: those whose goal held after one of the ticks, and after the last one.
         rate: successes / episodes, None without episodes.
         low, high: Wilson 95 % interval of the rate, None without episodes.
         steps_to_solve: mean control ticks of solved episodes, None without any.
@@ -51,6 +53,8 @@ class Row:
     instruction: str
     episodes: int
     successes: int
+    first: int
+    final: int
     rate: float | None
     low: float | None
     high: float | None
@@ -75,6 +79,7 @@ class Summary:
         extras: what the policy reported (``Record.extras``), by name: the mean an episode of what is a number, how
             often each was said of what is words.
         stand_ins: how many episodes ran with what in place of a missing file.
+        conditions: what the episodes ran under, see ``eval.conditions``; empty when no environment was made.
     """
 
     suite: str
@@ -87,6 +92,7 @@ class Summary:
     steps_per_s: float
     extras: Mapping[str, float | dict[str, int]] = field(default_factory=dict)
     stand_ins: Mapping[str, int] = field(default_factory=dict)
+    conditions: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
@@ -110,7 +116,13 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
 
 
 def summarise(
-    records: Iterable[Record], planned: Sequence[Episode], *, suite: str, policy: str, instructions: Sequence[str]
+    records: Iterable[Record],
+    planned: Sequence[Episode],
+    *,
+    suite: str,
+    policy: str,
+    instructions: Sequence[str],
+    conditions: Mapping[str, Any] | None = None,
 ) -> Summary:
     """Count.
 
@@ -119,6 +131,7 @@ def summarise(
         planned: every episode the evaluation was asked for.
         suite, policy: names for the heading.
         instructions: instruction of each task of the suite.
+        conditions: what the episodes ran under.
     """
     by_key = {record.key: record for record in records}
     wanted = dict.fromkeys(planned)
@@ -141,6 +154,7 @@ def summarise(
         steps_per_s=steps / wall_s if wall_s else 0.0,
         extras=_extras(found),
         stand_ins=dict(Counter(note for record in found for note in record.stand_ins).most_common()),
+        conditions=conditions or {},
     )
 
 
@@ -149,7 +163,8 @@ def table(summary: Summary) -> Table:
     rows = [_cells(row) for row in (*summary.tasks, summary.total)]
     healthy = rows[-1][-_PROBLEMS:] == ["0"] * _PROBLEMS
     shown = len(_COLUMNS) - (_PROBLEMS if healthy else 0)
-    result = Table(title=f"{escape(summary.suite)} · {escape(summary.policy)}", box=box.SIMPLE_HEAD, pad_edge=False)
+    title = f"{escape(summary.suite)} · {escape(summary.policy)}"
+    result = Table(title=title, caption=escape(describe(summary.conditions)), box=box.SIMPLE_HEAD, pad_edge=False)
     result.collapse_padding = True
     for column in _COLUMNS[:shown]:  # rich narrows only columns that may wrap: here the text, never a number
         result.add_column(column, justify="left" if column == _TEXT else "right", no_wrap=column != _TEXT)
@@ -169,7 +184,8 @@ def markdown(summary: Summary) -> str:
     reported = ["", "Reported by the policy, means an episode and counts:", "", *extras] if extras else []
     title = f"# {summary.suite}, policy {summary.policy}"
     missing = ["", f"{STAND_INS}:", "", *stand_in_lines(summary)] if summary.stand_ins else []
-    return "\n".join([title, "", *lines, "", closing_line(summary), *missing, *reported, ""])
+    ran_under = ["", describe(summary.conditions)] if summary.conditions else []
+    return "\n".join([title, *ran_under, "", *lines, "", closing_line(summary), *missing, *reported, ""])
 
 
 def closing_line(summary: Summary) -> str:
@@ -177,9 +193,17 @@ def closing_line(summary: Summary) -> str:
     total = summary.total
     return (
         f"{total.episodes} episodes ({total.faults} faulted), {total.errors} errors, {total.missing} not run. "
+        f"{_verdicts(total)}"
         f"{summary.steps:,} control steps in {summary.wall_s:.1f} s "
         f"({summary.steps_per_s:,.0f} steps/s, policy included), after {summary.setup_s:.1f} s of setup."
     )
+
+
+def _verdicts(total: Row) -> str:
+    """Both verdicts in a sentence, where they differ."""
+    if total.first == total.final:
+        return ""
+    return f"The goal held at some tick in {total.first} and at the last tick in {total.final} of them. "
 
 
 def stand_in_lines(summary: Summary) -> list[str]:
@@ -196,6 +220,8 @@ def _row(task: int | str, instruction: str, records: Sequence[Record], planned: 
         instruction=instruction,
         episodes=len(verdicts),
         successes=len(solved),
+        first=sum(record.success_first for record in verdicts),
+        final=sum(record.success_final for record in verdicts),
         rate=len(solved) / len(verdicts) if verdicts else None,
         low=low,
         high=high,

@@ -21,13 +21,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from eval.episodes import MAX_SLOTS, Batch, Episode, Suite, parse_episodes, parse_tasks, plan
+from eval.conditions import conditions
+from eval.episodes import ALL, MAX_SLOTS, Batch, Episode, Suite, parse_tasks, plan
 from eval.policies import Policy, extras_of, make_policy
 from eval.report import Summary, markdown, summarise
 from eval.store import CONFIG, Record, ResultStore, StoreError
+from vecenv import family, protocols
 from vecenv.assets import AssetsMissing
 from vecenv.cli import unknown
 from vecenv.contract import BatchEnv, Control, Metrics, ResetInfo
+from vecenv.placement import episode_indices
 
 # Called with which slots have just finished, bool [B], with the verdicts, bool [B], and with the faults, B strings.
 _Finish: TypeAlias = Callable[[np.ndarray, np.ndarray, Sequence[str]], None]
@@ -57,12 +60,13 @@ class EvalConfig:
         policy: name of the policy, see ``eval.policies.make_policy``.
         policy_args: constructor arguments of the policy.
         tasks: ``"all"``, or indices, ranges and names such as ``"0,3,5-7"`` or ``"widowx_stack_cube"``.
-        episodes: ``"all"``, a bare number for that many from the first on, or indices and ranges.
+        episodes: ``"all"``, those of the protocol; a bare number for that many from the first on; indices and ranges.
+        protocol: the evaluation protocol, see ``vecenv.protocols``; what is given besides goes before it.
         backend: physics backend.
         num_envs: most episodes that run at once, None for what suits the suite.
         num_threads: threads of the physics, None for the backend's own choice.
-        max_steps: step budget of an episode in control ticks, None for the suite's own.
-        seed: seed of the environment, and of the policy if it takes one.
+        max_steps: step budget of an episode in control ticks, None for the protocol's.
+        seed: seed of the environment, and of the policy if it takes one; None for the protocol's.
         env_args: further keyword arguments of ``vecenv.make``.
         fail_fast: stop at the first batch that raises.
         record: keep what is executed in ``demos/``, for ``vecenv replay``.
@@ -73,12 +77,13 @@ class EvalConfig:
     policy: str = "pick_place"
     policy_args: Mapping[str, Any] = field(default_factory=dict)
     tasks: str = "all"
-    episodes: str = "all"
+    episodes: str | Sequence[int] = "all"
+    protocol: str = protocols.DEFAULT
     backend: str = "native"
     num_envs: int | None = None
     num_threads: int | None = None
     max_steps: int | None = None
-    seed: int = 0
+    seed: int | None = None
     env_args: Mapping[str, Any] = field(default_factory=dict)
     fail_fast: bool = False
     record: bool = False
@@ -140,11 +145,11 @@ class Simulator:
     """The two functions the runner needs from a library of environments.
 
     Attributes:
-        suite: describes a suite by name, or raises ``ConfigError``.
+        suite: describes a suite under a protocol, both by name, or raises ``ConfigError``.
         make: builds an environment, as ``vecenv.make`` does: ``tasks`` times ``episodes`` slots.
     """
 
-    suite: Callable[[str], Suite]
+    suite: Callable[[str, str], Suite]
     make: Callable[..., BatchEnv]
 
 
@@ -155,17 +160,21 @@ def vecenv_simulator() -> Simulator:
     return Simulator(describe_suite, vecenv.make)
 
 
-def describe_suite(name: str) -> Suite:
-    """Describe one of ``vecenv``'s suites.
+def describe_suite(name: str, protocol: str = protocols.DEFAULT) -> Suite:
+    """Describe one of ``vecenv``'s suites under a protocol.
 
     Raises:
-        ConfigError: there is no suite of that name.
+        ConfigError: there is no suite or protocol of that name, or they do not go together.
     """
     import vecenv
 
     suites = tuple(vecenv.list_suites())
     if name not in suites:
         raise ConfigError(unknown("suite", name, suites))
+    try:
+        per_task = vecenv.eval_metadata(name, protocol)["episodes_per_task"]
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
     tasks = vecenv.list_tasks(name)
     simpler = vecenv.family(name) == _SIMPLER
     return Suite(
@@ -173,7 +182,9 @@ def describe_suite(name: str) -> Suite:
         instructions=tuple(task.instruction for task in tasks),
         # SIMPLER exchanges scenes by itself, so its environments need no new one for other tasks.
         scenes=tuple("" if simpler else task.problem().scene_key() for task in tasks),
-        num_episodes=vecenv.eval_metadata(name)["episodes_per_task"],
+        # LIBERO has 50 starts of every task, whatever a protocol runs of them.
+        num_episodes=per_task if simpler else max(per_task, vecenv.eval_metadata(name)["episodes_per_task"]),
+        every=None if simpler else per_task,
         tasks=tuple(task.name for task in tasks),
         max_slots=_SIMPLER_SLOTS if simpler else MAX_SLOTS,
     )
@@ -231,18 +242,17 @@ class Evaluation:
     def __init__(self, config: EvalConfig, simulator: Simulator | None = None) -> None:
         self.config = config
         self.simulator = simulator or vecenv_simulator()
-        self.suite = self.simulator.suite(config.suite)
-        self.tasks = parse_tasks(config.tasks, len(self.suite.instructions), self.suite.tasks)
-        self.episodes = parse_episodes(config.episodes, self.suite.num_episodes)
+        self.suite = self.simulator.suite(config.suite, config.protocol)
+        self.tasks, self.episodes = _wanted(config, self.suite)
         _check_make(self.simulator, config)
         _check_record(config)
         _check_policy(config)
-        self.policy = make_policy(config.policy, seed=config.seed, **config.policy_args)
+        self.policy = make_policy(config.policy, seed=_seed(config), **config.policy_args)
 
     @property
     def planned(self) -> tuple[Episode, ...]:
         """Every episode asked for, task by task."""
-        return Batch(self.suite.name, self.tasks, self.episodes).slots
+        return tuple(Episode(self.suite.name, task, e) for task in self.tasks for e in self.episodes[task])
 
     def batches(self, done: Collection[Episode] = ()) -> list[Batch]:
         """The batches that run every planned episode but those in ``done``."""
@@ -273,6 +283,7 @@ class Evaluation:
             suite=self.suite.name,
             policy=self.policy.name,
             instructions=self.suite.instructions,
+            conditions=store.config().get("conditions", {}),
         )
         store.write_summary(summary.to_dict(), markdown(summary))
         return EvalResult(
@@ -390,7 +401,7 @@ class _Run:
         from eval.demos import make_options, write_demos
         from eval.record import Recorder
 
-        options = make_options(self.simulator.make, **_make_arguments(self.config))
+        options = make_options(self.simulator.make, suite=self.suite.name, **_make_arguments(self.config))
         episodes = [slot.episode for slot in placed.slots]
         recorder = Recorder(env, episodes, options, states=self.config.record_states)
         try:
@@ -412,6 +423,8 @@ class _Run:
             episode=episode.episode,
             instruction=placed.instructions[slot],
             success=bool(metrics.success[slot]),
+            success_first=bool(metrics.success_first[slot]),
+            success_final=bool(metrics.success_final[slot]),
             num_steps=int(metrics.num_steps[slot]),
             reward=float(metrics.cumulative_reward[slot]),
             fault=control.info["fault"][slot],
@@ -431,6 +444,7 @@ class _Run:
         else:
             self._close()
             self._env, self._layout = self._make(batch), layout
+            self.store.write_config({**self.store.config(), "conditions": conditions(self._env, self.config)})
         return self._env, self._env.reset()
 
     def _make(self, batch: Batch) -> BatchEnv:
@@ -539,8 +553,29 @@ def _slots(info: ResetInfo, batch: Batch) -> list[Episode]:
 
 
 def _make_arguments(config: EvalConfig) -> dict[str, Any]:
-    arguments = {"backend": config.backend, "seed": config.seed, "num_threads": config.num_threads, **config.env_args}
-    return arguments if config.max_steps is None else {**arguments, "max_steps": config.max_steps}
+    arguments = {"backend": config.backend, "num_threads": config.num_threads, **config.env_args}
+    given: dict[str, Any] = {"seed": config.seed, "max_steps": config.max_steps}
+    if config.protocol != protocols.DEFAULT:
+        given["protocol"] = config.protocol
+    return {**arguments, **{name: value for name, value in given.items() if value is not None}}
+
+
+def _seed(config: EvalConfig) -> int:
+    """The seed of the policy: as given, else the environment's under the protocol, 0 where it has none."""
+    if config.seed is not None:
+        return config.seed
+    return protocols.protocol(config.protocol, family(config.suite)).seed or 0
+
+
+def _wanted(config: EvalConfig, suite: Suite) -> tuple[tuple[int, ...], dict[int, tuple[int, ...]]]:
+    """The tasks, and which episodes of each."""
+    tasks = parse_tasks(config.tasks, len(suite.instructions), suite.tasks)
+    if config.tasks.strip() == ALL:
+        tasks = tuple(task for task in tasks if suite.episodes_of(task))
+    missing = [task for task in tasks if not suite.episodes_of(task)]
+    if missing:
+        raise ConfigError(f"protocol {config.protocol!r} has no episodes of task {missing[0]} of {suite.name}")
+    return tasks, {task: episode_indices(config.episodes, suite.episodes_of(task), suite.every) for task in tasks}
 
 
 def _check_make(simulator: Simulator, config: EvalConfig) -> None:

@@ -35,7 +35,9 @@ class Record:
     Attributes:
         suite, task, episode: which episode.
         instruction: its language instruction.
-        success: the task was solved.
+        success: the task was solved, in the sense of the protocol: one of the next two.
+        success_first: the goal held after one of the ticks.
+        success_final: the goal held after the last one.
         num_steps: control ticks executed.
         reward: sum of rewards, None when it was not finite.
         fault: why the slot was quarantined, "" when it was healthy. Such an episode counts as a failure.
@@ -63,6 +65,8 @@ class Record:
     wall_s: float = 0.0
     extras: Mapping[str, Any] = field(default_factory=dict)
     stand_ins: tuple[str, ...] = ()
+    success_first: bool = False
+    success_final: bool = False
 
     @property
     def key(self) -> Episode:
@@ -190,8 +194,10 @@ def _parse(line: str, where: str) -> Record:
     known = {f.name for f in fields(Record)}
     try:
         values = {key: value for key, value in json.loads(line).items() if key in known}
-        return Record(**{**values, "stand_ins": tuple(values.get("stand_ins", ()))})
-    except (json.JSONDecodeError, TypeError, AttributeError) as error:
+        # Files of before had one verdict, which was both.
+        both = {name: values.get(name, values["success"]) for name in ("success_first", "success_final")}
+        return Record(**{**values, **both, "stand_ins": tuple(values.get("stand_ins", ()))})
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"{where} is not an episode: {error}") from None
 
 

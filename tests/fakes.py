@@ -151,4 +151,4 @@ class FakeWorld:
 
     @property
     def simulator(self) -> Simulator:
-        return Simulator(lambda name: self.suite, self.make)
+        return Simulator(lambda name, protocol: self.suite, self.make)

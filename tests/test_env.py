@@ -260,7 +260,10 @@ class TestPlacement:
             ({"tasks": [0, 10]}, "task 10"),
             ({"episodes": [50]}, "episode 50"),
             ({"episodes": []}, "empty"),
-            ({"tasks": ["0"]}, "integer"),
+            ({"tasks": [0.5]}, "integer"),
+            ({"tasks": ["zebra"]}, "cannot read 'zebra' as tasks"),
+            ({"tasks": "pick_up"}, "'pick_up' fits 10"),
+            ({"episodes": 3}, r"write \[3\] for episode 3 alone, or '3' for the first 3"),
         ],
     )
     def test_what_does_not_exist_is_named(self, options: dict[str, Any], message: str) -> None:

@@ -113,5 +113,6 @@ def test_tasks_may_be_asked_for_by_name() -> None:
     names = ("stack_cube", "open_drawer", "0-1")
     assert parse_tasks("open_drawer, 0", 3, names) == (1, 0)
     assert parse_tasks("0-1", 3, names) == (2,)
-    with pytest.raises(SpecError, match=r"cannot read 'stack_cub' as tasks.*did you mean stack_cube"):
-        parse_tasks("stack_cub", 3, names)
+    assert parse_tasks("stack", 3, names) == (0,)
+    with pytest.raises(SpecError, match=r"cannot read 'stack_cubs' as tasks.*did you mean stack_cube"):
+        parse_tasks("stack_cubs", 3, names)

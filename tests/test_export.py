@@ -80,7 +80,7 @@ def copy(exported: Path, tmp_path: Path) -> Path:
 
 
 def make(folder: Path, suite: str = "libero_goal", **options: Any) -> LiberoEnv:
-    env = vecenv.make(suite, **{"task": 0, "episodes": 0, "scenes": folder, **options})
+    env = vecenv.make(suite, **{"task": 0, "episodes": [0], "scenes": folder, **options})
     assert isinstance(env, LiberoEnv)
     return env
 
@@ -144,7 +144,7 @@ def test_several_suites_read_one_folder(exported: Path) -> None:
 
 
 def test_a_folder_may_be_given_as_text(exported: Path) -> None:
-    assert vecenv.make("libero_goal", task=0, episodes=0, scenes=str(exported)).reset().suite == "libero_goal"
+    assert vecenv.make("libero_goal", task=0, episodes=[0], scenes=str(exported)).reset().suite == "libero_goal"
 
 
 # -- folders that cannot be used ---------------------------------------------------------------------------------------

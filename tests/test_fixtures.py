@@ -192,9 +192,9 @@ def test_what_is_no_pose_is_refused_by_the_fixtures_name(pose: Any, message: str
 
 @pytest.mark.parametrize("mode", ["centre", None, ["center"], 3])
 def test_unknown_modes_are_refused(mode: Any) -> None:
-    with pytest.raises(FixtureError, match="expected 'center', 'sampled' or a mapping"):
+    with pytest.raises(FixtureError, match="expected 'center', 'sampled', 'upstream' or a mapping"):
         stand(mode)
-    with pytest.raises(FixtureError, match="expected 'center', 'sampled' or a mapping"):
+    with pytest.raises(FixtureError, match="expected 'center', 'sampled', 'upstream' or a mapping"):
         check_names(mode, [scene_of(SCENE)[1]])
 
 

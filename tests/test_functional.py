@@ -131,7 +131,7 @@ def test_the_same_call_gives_the_same_result_and_leaves_its_arguments(plain: Com
 
 def test_it_steps_as_the_batched_environment_does(plain: Compiled, state: State) -> None:
     episodes = np.asarray(state.info["episode"]).tolist()
-    batched = vecenv.make("libero_object", tasks=[0] * WORLDS, episodes=0, backend="warp", budget=BUDGET)
+    batched = vecenv.make("libero_object", tasks=[0] * WORLDS, episodes=[0], backend="warp", budget=BUDGET)
     assert isinstance(batched, BatchedEnv)
     batched.set_episodes(episodes=episodes)
     batched.reset()

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vecenv.placement import Placement, PlacementError, cross, each
+from vecenv.placement import Placement, PlacementError, cross, each, episode_indices, task_indices
 
 SIZES = {"num_tasks": 10, "num_episodes": 50}
 
@@ -27,13 +27,37 @@ def test_every_episode_of_every_task_task_by_task() -> None:
 
 @pytest.mark.parametrize("tasks", [4, np.int64(4), [4], (4,), np.array([4]), range(4, 5), {4}, iter([4])])
 def test_one_index_or_any_sequence_of_them(tasks: Any) -> None:
-    assert pairs(cross(tasks, 7, **SIZES)) == [(4, 7)]
+    assert pairs(cross(tasks, [7], **SIZES)) == [(4, 7)]
 
 
 def test_episodes_may_differ_by_task() -> None:
-    placement = cross([0, 2, 5], {0: [1, 2], 5: 3}, **SIZES)
+    placement = cross([0, 2, 5], {0: [1, 2], 5: [3]}, **SIZES)
     assert pairs(placement) == [(0, 1), (0, 2), (5, 3)]
     assert len(placement) == 3
+
+
+@pytest.mark.parametrize(
+    ("spec", "episodes"),
+    [
+        (None, range(50)),
+        ("all", range(50)),
+        ("3", range(3)),
+        ("5,", [5]),
+        ("5-5", [5]),
+        ("0,3,5-7", [0, 3, 5, 6, 7]),
+        ([5], [5]),
+        (np.array([5, 1]), [5, 1]),
+        ({2: "2"}, [0, 1]),
+    ],
+)
+def test_episodes_are_named_as_in_an_evaluation(spec: Any, episodes: Any) -> None:
+    assert pairs(cross([2], spec, **SIZES)) == [(2, episode) for episode in episodes]
+
+
+def test_all_episodes_are_those_of_the_protocol_while_others_may_be_named() -> None:
+    assert episode_indices("all", 50, every=10) == tuple(range(10))
+    assert episode_indices(None, 50, every=10) == tuple(range(10))
+    assert episode_indices("12", 50, every=10) == tuple(range(12))
 
 
 def test_a_whole_suite_is_five_hundred_slots() -> None:
@@ -47,10 +71,15 @@ def test_a_whole_suite_is_five_hundred_slots() -> None:
     [
         (10, 0, r"task 10 does not exist; there are 10 \(0 to 9\)"),
         (-1, 0, "task -1 does not exist"),
-        (0, 50, r"episode 50 does not exist; there are 50 \(0 to 49\)"),
-        ([0, 1], {0: 0, 1: 99}, "episode 99"),
+        (0, [50], r"episode 50 does not exist; there are 50 \(0 to 49\)"),
+        ([0, 1], {0: [0], 1: [99]}, "episode 99"),
         ([], 0, "no slot to fill"),
         (0, [], "no slot to fill"),
+        (0, 3, r"write \[3\] for episode 3 alone, or '3' for the first 3$"),
+        (0, np.int64(0), r"episodes=0: a bare number used to mean one episode.*write \[0\] for episode 0 alone$"),
+        (0, {0: 3}, r"write \[3\]"),
+        (0, "51", "ask for 1 to 50"),
+        (0, "0,x", "cannot read 'x' as episodes"),
         (0, {1: [0]}, "no slot to fill"),
         ("0", 0, "task: '0' is not an integer"),
         (0.0, 0, "task: 0.0 is not an integer"),
@@ -65,6 +94,54 @@ def test_a_whole_suite_is_five_hundred_slots() -> None:
 def test_what_cannot_be_placed_is_refused(tasks: Any, episodes: Any, message: str) -> None:
     with pytest.raises(PlacementError, match=message):
         cross(tasks, episodes, **SIZES)
+
+
+# -- tasks by name -----------------------------------------------------------------------------------------------------
+
+NAMES = ("open_the_top_drawer", "open_the_middle_drawer", "put_the_bowl_on_the_plate", "SCENE1_open_the_top_drawer")
+
+
+@pytest.mark.parametrize(
+    ("tasks", "indices"),
+    [
+        (None, (0, 1, 2, 3)),
+        ("all", (0, 1, 2, 3)),
+        ("open_the_top_drawer", (0,)),
+        ("bowl", (2,)),
+        ("Bowl on the  plate", (2,)),
+        ("scene1", (3,)),
+        ("middle, 0", (1, 0)),
+        ("1-2", (1, 2)),
+        (["bowl", 3], (2, 3)),
+        (np.array([3, 3]), (3, 3)),
+        (2, (2,)),
+    ],
+)
+def test_tasks_are_named_by_index_or_name_or_a_part_that_only_one_has(tasks: Any, indices: tuple[int, ...]) -> None:
+    assert task_indices(tasks, NAMES) == indices
+
+
+@pytest.mark.parametrize(
+    ("tasks", "message"),
+    [
+        ("drawer", "'drawer' fits 3: open_the_top_drawer, open_the_middle_drawer, SCENE1_open_the_top_drawer; write"),
+        ("put_the_bowl_on_the_plat3", "did you mean put_the_bowl_on_the_plate"),
+        ("zebra", "did you mean open_the_top_drawer, open_the_middle_drawer, put_the_bowl_on_the_plate, SCENE1"),
+        (["bowl", "zebra"], "cannot read 'zebra'"),
+        ("4", "there is no task 4: the last one is 3"),
+        (4, r"task 4 does not exist; there are 4 \(0 to 3\)"),
+        (1.5, "1.5 is not an integer"),
+        ({0: 1}, "is not an integer"),
+    ],
+)
+def test_tasks_that_do_not_exist_or_are_not_the_only_one_are_refused(tasks: Any, message: str) -> None:
+    with pytest.raises(PlacementError, match=message):
+        task_indices(tasks, NAMES)
+
+
+def test_a_long_list_of_names_is_cut_short() -> None:
+    with pytest.raises(PlacementError, match=r"fits 90: .*, \.\.\. \(78 more\); write"):
+        task_indices("task", [f"task_{i}" for i in range(90)])
 
 
 # -- each --------------------------------------------------------------------------------------------------------------

@@ -66,6 +66,8 @@ def tiny_scene() -> Scene:
             joints=(),
             contact_geoms=(),
             bottom_z=0.0,
+            top_z=0.0,
+            radius=0.0,
         )
 
     return Scene(

@@ -24,11 +24,11 @@ class Scripted(SlotBatch):
 
     _error = Refused
 
-    def __init__(self, num_envs: int) -> None:
-        super().__init__("suite", num_envs)
+    def __init__(self, num_envs: int, **options: Any) -> None:
+        super().__init__("suite", num_envs, **options)
         self.armed: list[list[int]] = []
         self.failures: dict[int, str] = {}
-        self._place(placing.cross(range(num_envs), 0, num_tasks=num_envs, num_episodes=50))
+        self._place(placing.cross(range(num_envs), [0], num_tasks=num_envs, num_episodes=50))
 
     def tick(self, success: tuple[int, ...] = (), fail: Mapping[int, str] | None = None) -> Control:
         """One tick of all slots that are not done."""

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from vecenv.contract import BatchEnv
     from vecenv.physics.budgets import Budget
+    from vecenv.protocols import Protocol, ResetLoop
     from vecenv.render.options import RenderConfig
     from vecenv.simpler.variants import Variant
 
@@ -41,15 +42,18 @@ def make(
     task: Any = None,
     tasks: Any = None,
     episodes: Any = None,
+    protocol: str = "seed",
     backend: str = "native",
     max_steps: int | None = None,
-    seed: int = 0,
+    success: str | None = None,
+    seed: int | None = None,
     num_threads: int | None = None,
     geometry: str = "exact",
     contacts: str = "published",
-    fixtures: Any = "center",
-    start: str = "settled",
-    settle_steps: int = 10,
+    fixtures: Any = None,
+    reset_loop: ResetLoop | Mapping[str, Any] | None = None,
+    start: str | None = None,
+    settle_steps: int | None = None,
     num_devices: int = 1,
     budget: Budget | None = None,
     render: RenderConfig | None = None,
@@ -64,22 +68,32 @@ def make(
 
     Args:
         suite: one of ``list_suites()``.
-        task: a single task: its index, or in SIMPLER its name.
-        tasks: several tasks; all tasks of the suite when neither is given.
-        episodes: episodes 0 to 49, one or several; or a mapping task index -> episodes. All 50 by default.
+        task: a single task: its index, or its name; in LIBERO also a part that only one name has.
+        tasks: several tasks; all tasks of the suite when neither is given. In LIBERO also ``"0,3,5-7"``.
+        episodes: as for ``vecenv eval``: ``"all"``, ``"5"`` for the first five, or ``"0,3,5-7"``; also a sequence of
+            indices, or a mapping task index -> any of these. The protocol's by default, and no bare number.
         backend: ``"native"``: physics on the CPU, the suite's own simulator: MuJoCo on threads in float64 for LIBERO,
             SAPIEN's PhysX in worker processes (also called ``"physx_cpu"``) for SIMPLER. LIBERO only: ``"warp"``: MJX
             on MuJoCo Warp (NVIDIA GPUs; also runs on a CPU); ``"jax"``: MJX in pure JAX, any device; ``"mjx"``: warp on
             CUDA, jax elsewhere.
-        max_steps: step budget in control ticks. None: 2500 (at 20 a second) in LIBERO, the task's own in SIMPLER.
+        protocol: the evaluation protocol that options come from where they are not given, ``max_steps``, ``success``,
+            ``seed``, ``fixtures``, ``reset_loop``, ``start``, ``settle_steps``, ``episodes`` and the size of images
+            among them; one of ``vecenv.protocols``. ``"seed"`` is this project's own: in LIBERO 2,500 ticks from
+            settled starts, in SIMPLER seeds 2022 to 2071.
+        max_steps: step budget in control ticks (LIBERO: 20 a second); SIMPLER's tasks have their own.
+        success: ``"first"``: an episode ends when its goal first holds; ``"final"``: it goes on to the end of its
+            budget, and the verdict is read there. ``evaluate`` reports both.
         seed: see ``fixtures``; SIMPLER's episodes depend on their number alone.
         num_threads: threads of LIBERO's native backend, worker processes of SIMPLER; None for one a core.
         geometry: LIBERO. ``"exact"``: the collision geometry of upstream. ``"lean"``: at most 24 fitted geoms a scene.
         contacts: LIBERO. ``"published"``: those of MuJoCo 2.3 to 3.3, under which LIBERO's data and checkpoints were
             made and scored. ``"current"``: those of the installed MuJoCo.
         fixtures: LIBERO. Where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"``
-            from it (a function of seed, suite, task and episode), or name -> (pos [3] or [B, 3], quat wxyz [4] or
-            [B, 4]).
+            from it (a function of seed, suite, task and episode), ``"upstream"``: where upstream's ``env.seed(seed)``
+            and the resets of an evaluation script put them, or name -> (pos [3] or [B, 3], quat wxyz [4] or [B, 4]).
+        reset_loop: LIBERO, for ``fixtures="upstream"``: how that script seeds and resets, a
+            ``vecenv.protocols.ResetLoop`` or a mapping of its fields; seeded once a task, one reset an episode by
+            default.
         start: LIBERO. ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them; ``"raw"``: init states as
             stored, followed by ``settle_steps``.
         settle_steps: LIBERO, for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
@@ -101,19 +115,24 @@ def make(
 
     Raises:
         OptionError: an option that suites of this kind do not have.
+        ProtocolError: a protocol that they do not have.
         ExtraMissing: SIMPLER's packages are not installed.
         AssetsMissing: its files are not there.
         KeyError, ValueError, RuntimeError: subclasses that name the suite, task, option or asset that is wrong.
     """
+    from vecenv import protocols
+
+    chosen = protocols.protocol(protocol, family(suite))
     common = {"task": task, "tasks": tasks, "episodes": episodes, "backend": backend}
-    if max_steps is not None:
-        common["max_steps"] = max_steps
+    given = {"max_steps": max_steps, "success": success}
+    decided = chosen.options(suite) | {name: value for name, value in given.items() if value is not None}
     libero = {
         "geometry": (geometry, "exact"),
         "contacts": (contacts, "published"),
-        "fixtures": (fixtures, "center"),
-        "start": (start, "settled"),
-        "settle_steps": (settle_steps, 10),
+        "fixtures": (fixtures, None),
+        "reset_loop": (reset_loop, None),
+        "start": (start, None),
+        "settle_steps": (settle_steps, None),
         "num_devices": (num_devices, 1),
         "budget": (budget, None),
         "render": (render, None),
@@ -127,11 +146,14 @@ def make(
         "assets": (assets, None),
     }
     if family(suite) == _SIMPLER:
-        return _make_simpler(suite, {**common, "num_workers": num_threads, **_own(suite, simpler, libero)})
-    own = _own(suite, libero, simpler)
+        own: dict[str, Any] = {**decided, **_own(suite, simpler, libero)}
+        if chosen.name != protocols.DEFAULT:
+            own["protocol"] = chosen.name
+        return _make_simpler(suite, {**common, "num_workers": num_threads, **own})
+    own = {**decided, **({} if seed is None else {"seed": seed}), **_own(suite, libero, simpler)}
     from vecenv.libero import env
 
-    return env.make(suite, **common, seed=seed, num_threads=num_threads, **own)
+    return env.make(suite, protocol=chosen, **common, num_threads=num_threads, **own)
 
 
 def _own(suite: str, own: Mapping[str, tuple[Any, Any]], foreign: Mapping[str, tuple[Any, Any]]) -> dict[str, Any]:
@@ -162,6 +184,20 @@ def _make_simpler(suite: str, options: dict[str, Any]) -> BatchEnv:
 def family(suite: str) -> str:
     """Which benchmark a suite belongs to by its name: ``"simpler"`` for ``simpler/...``, else ``"libero"``."""
     return _SIMPLER if suite.split("/")[0] == _SIMPLER else "libero"
+
+
+def _simpler_metadata(suite: str, protocol: Protocol) -> dict[str, Any]:
+    """SIMPLER's metadata with the episodes that a protocol has of each task; 0 of those that it leaves out."""
+    from vecenv.simpler import tasks as simpler_tasks
+
+    metadata = simpler_tasks.eval_metadata(suite)
+    if protocol.episodes is not None:
+        return metadata
+    from vecenv.simpler import published
+
+    counts = published.counts(protocol.name, suite)
+    per_task = tuple(counts.get(index, 0) for index in range(metadata["num_tasks"]))
+    return {**metadata, "episodes_per_task": per_task, "num_episodes": sum(per_task)}
 
 
 def list_suites(family: str | None = None) -> tuple[str, ...]:
@@ -202,28 +238,33 @@ def list_tasks(suite: str) -> tuple[Any, ...]:
     return suites.list_tasks(suite)
 
 
-def eval_metadata(suite: str) -> dict[str, Any]:
-    """What an evaluation of a suite consists of: tasks, episodes, budget, metrics, instructions.
+def eval_metadata(suite: str, protocol: str = "seed") -> dict[str, Any]:
+    """What an evaluation of a suite consists of: tasks, episodes, budget, metrics, instructions, and the protocol.
 
-    ``max_steps`` is one number in LIBERO and one a task in SIMPLER. Needs neither SAPIEN nor SIMPLER's assets.
+    ``max_steps`` is one number in LIBERO and one a task in SIMPLER, and so is ``episodes_per_task`` under a protocol
+    whose tasks differ. ``protocol`` holds all that the protocol fixes (``vecenv.protocols.Protocol``). Needs neither
+    SAPIEN nor SIMPLER's assets.
 
     Raises:
         KeyError: a subclass that lists the suites there are.
+        ProtocolError: suites of this kind have no such protocol.
     """
-    if family(suite) == _SIMPLER:
-        from vecenv.simpler import tasks as simpler_tasks
+    from vecenv import protocols
 
-        return simpler_tasks.eval_metadata(suite)
+    chosen = protocols.protocol(protocol, family(suite))
+    if family(suite) == _SIMPLER:
+        return {**_simpler_metadata(suite, chosen), "protocol": chosen.to_dict()}
     from vecenv.libero import suites
-    from vecenv.libero.env import MAX_STEPS
 
     tasks = suites.list_tasks(suite)
+    episodes = chosen.episodes or suites.NUM_EPISODES
     return {
         "suite": suite,
+        "protocol": chosen.to_dict(),
         "num_tasks": len(tasks),
-        "episodes_per_task": suites.NUM_EPISODES,
-        "num_episodes": len(tasks) * suites.NUM_EPISODES,
-        "max_steps": MAX_STEPS,
+        "episodes_per_task": episodes,
+        "num_episodes": len(tasks) * episodes,
+        "max_steps": chosen.horizon_of(suite),
         "metrics": ("success", "num_steps", "cumulative_reward"),
         "action_space": ("step_continuous", "step_ee_pose"),
         "control_hz": 20,

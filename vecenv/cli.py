@@ -14,9 +14,12 @@ import importlib.metadata
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
+
+if TYPE_CHECKING:
+    from vecenv.protocols import Protocol
 
 COMMAND_GROUP = "vecenv.commands"
 
@@ -70,11 +73,15 @@ def doctor_command(as_json: bool = typer.Option(False, "--json", help="Print one
 
 def list_command(
     suite: str = typer.Argument("", help="A suite, to list its tasks; without it, the suites are listed."),
+    protocol: bool = typer.Option(False, "--protocols", help="List the evaluation protocols instead."),
     as_json: bool = typer.Option(False, "--json", help="Print JSON instead."),
 ) -> None:
-    """List the suites, or the tasks of one suite."""
+    """List the suites, the tasks of one suite, or the evaluation protocols and where they come from."""
     import vecenv
 
+    if protocol:
+        _list_protocols(suite, as_json)
+        return
     suites = tuple(vecenv.list_suites())
     if suite and suite not in suites:
         fail(unknown("suite", suite, suites))
@@ -84,6 +91,21 @@ def list_command(
         typer.echo(json.dumps(rows, indent=2))
     else:
         _print_rows(rows)
+
+
+def _list_protocols(suite: str, as_json: bool) -> None:
+    """Every protocol, or those of a suite."""
+    import vecenv
+    from vecenv.protocols import PROTOCOLS
+
+    if suite and suite not in vecenv.list_suites():
+        fail(unknown("suite", suite, vecenv.list_suites()))
+    families = [vecenv.family(suite)] if suite else list(PROTOCOLS)
+    chosen = [each for family in families for each in PROTOCOLS[family].values()]
+    if as_json:
+        typer.echo(json.dumps([each.to_dict() for each in chosen], indent=2))
+    else:
+        _print_protocols(chosen)
 
 
 def compile_command(
@@ -194,3 +216,33 @@ def _print_rows(rows: list[dict[str, Any]]) -> None:
     for row in rows:
         table.add_row(*map(str, row.values()))
     Console().print(table)
+
+
+def _print_protocols(chosen: Sequence[Protocol]) -> None:
+    """A table of what protocols fix, then each one's source and what else is to be known."""
+    from rich.console import Console
+
+    _print_rows([_protocol_row(each) for each in chosen])
+    console = Console()
+    for each in chosen:
+        said = "; ".join(map(str, each.sources)) + (f". {each.note}" if each.note else "")
+        console.print(f"{each.family} {each.name}: {said}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _protocol_row(protocol: Protocol) -> dict[str, Any]:
+    """Columns for the screen; "-" stands for what is a task's own or not a choice."""
+    horizon = "/".join(str(ticks) for ticks in dict(protocol.horizon).values())
+    row = {
+        "protocol": protocol.name,
+        "suites": protocol.family,
+        "horizon": horizon,
+        "idle": protocol.idle_steps,
+        "start": protocol.start,
+        "fixtures": protocol.fixtures,
+        "seed": protocol.seed,
+        "episodes": protocol.episodes,
+        "image": protocol.image_size,
+        "success": protocol.success,
+        "replan": protocol.policy.replan_steps,
+    }
+    return {name: "-" if value in (None, "") else value for name, value in row.items()}

@@ -12,6 +12,9 @@ Rules that hold for every environment:
 * ``observe_*`` never advances a slot; on a finished slot it reads the terminal state.
 * ``terminated`` means success, ``truncated`` means the step budget ran out (or the slot was quarantined). A finished
   slot ignores further steps: reward 0, flags kept.
+* What success means is an option. ``"first"``: an episode ends when its goal first holds. ``"final"``: it goes on to
+  the end of its budget, and the verdict is read there. ``evaluate`` reports both. The reward is 1 at the tick at which
+  the goal first holds, else 0.
 * A chunk of K actions stops at a slot's own terminal step; the other slots go on.
 * NaN and infinities in actions become 0 and values are clipped to the action range; ``info["mended"]`` says where.
 * A slot whose physics fails (non-finite state, exhausted contact memory) is quarantined: ``info["fault"][i]`` names the
@@ -26,6 +29,8 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+# When an episode that reaches its goal ends: there, or at the end of its budget.
+FIRST, FINAL = SUCCESS_MODES = ("first", "final")
 # Columns of the 7-vector taken by ``step_continuous``.
 ACTION_DIM = 7
 # Columns of the 8-vector taken by ``step_ee_pose``: x, y, z, qw, qx, qy, qz, grip (1 closed, 0 open).
@@ -388,6 +393,8 @@ class Metrics:
         suite: suite name.
         task_id: int [B].
         cumulative_reward: sum of rewards since the episode began, float64 [B].
+        success_first: the goal held after one of the ticks, bool [B].
+        success_final: the goal held after the last executed tick, bool [B]; ``success`` is this.
     """
 
     success: np.ndarray
@@ -395,6 +402,14 @@ class Metrics:
     suite: str
     task_id: np.ndarray
     cumulative_reward: np.ndarray
+    success_first: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    success_final: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+
+    def __post_init__(self) -> None:
+        # Where episodes end at success, the two are one.
+        for name in ("success_first", "success_final"):
+            if len(getattr(self, name)) != len(self.success):
+                object.__setattr__(self, name, self.success.copy())
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,14 @@
-"""Which (task, episode) sits in which slot of a batch."""
+"""Which (task, episode) sits in which slot of a batch, and how a person says so.
+
+Tasks are named by index, range or name, episodes by index, range or count: ``"0,3,5-7"``. ``vecenv.make`` and ``vecenv
+eval`` read both with the functions here, so that a specification means the same in either.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +17,16 @@ import numpy as np
 
 class PlacementError(ValueError):
     """Tasks or episodes that do not exist or do not fit the batch; the message says which."""
+
+
+class SpecError(PlacementError):
+    """A specification of tasks or episodes cannot be read, or asks for something that does not exist."""
+
+
+ALL = "all"
+# Names that an error lists before it only counts them.
+_LISTED = 12
+_RANGE = re.compile(r"(\d+)(?:\s*-\s*(\d+))?")
 
 
 @dataclass(frozen=True)
@@ -45,13 +61,85 @@ def _check(values: Iterable[int], count: int, what: str) -> None:
             raise PlacementError(f"{what} {value} does not exist; there are {count} (0 to {count - 1})")
 
 
-def cross(tasks: Any, episodes: Any, *, num_tasks: int, num_episodes: int) -> Placement:
+def parse_tasks(spec: str, num_tasks: int, names: Sequence[str] = ()) -> tuple[int, ...]:
+    """Read task indices: ``"all"``, or indices, ranges and names such as ``"0,3,5-7,widowx_stack_cube"``.
+
+    Args:
+        spec: the text. A name may be a part that only one name has; case does not matter, and spaces are underscores.
+        num_tasks: how many tasks the suite has.
+        names: what they are called.
+
+    Raises:
+        SpecError: the text cannot be read, names a task the suite does not have, or fits several.
+    """
+    return tuple(range(num_tasks)) if spec.strip() == ALL else _parse_indices(spec, num_tasks, "task", names)
+
+
+def parse_episodes(spec: str, num_episodes: int, every: int | None = None) -> tuple[int, ...]:
+    """Read episode indices: ``"all"``, a bare number for that many from the first on, or a list as for tasks.
+
+    ``"5"`` means episodes 0 to 4; the single episode 5 is ``"5-5"`` or ``"5,"``.
+
+    Args:
+        spec: the text.
+        num_episodes: how many the task has.
+        every: how many ``"all"`` are, where a protocol has fewer.
+
+    Raises:
+        SpecError: the text cannot be read, or asks for episodes the task does not have.
+    """
+    text = spec.strip()
+    if text == ALL:
+        return tuple(range(num_episodes if every is None else every))
+    if not text.isdecimal():
+        return _parse_indices(text, num_episodes, "episode")
+    if not 1 <= int(text) <= num_episodes:
+        raise SpecError(f"{text} episodes asked for: each task has {num_episodes}, ask for 1 to {num_episodes}")
+    return tuple(range(int(text)))
+
+
+def episode_indices(episodes: Any, num_episodes: int, every: int | None = None) -> tuple[int, ...]:
+    """Episodes as ``vecenv.make`` takes them: None or ``"all"``, a text as for ``parse_episodes``, or indices.
+
+    Raises:
+        PlacementError: a bare number, something that is no index, or an episode that does not exist.
+    """
+    if episodes is None or isinstance(episodes, str):
+        return parse_episodes(ALL if episodes is None else episodes, num_episodes, every)
+    if isinstance(episodes, int | np.integer) and not isinstance(episodes, bool):
+        count = f", or '{episodes}' for the first {episodes}" if episodes > 0 else ""
+        raise SpecError(
+            f"episodes={episodes}: a bare number used to mean one episode here and a count in `vecenv eval`; "
+            f"write [{episodes}] for episode {episodes} alone{count}"
+        )
+    chosen = _ints(episodes, "episode")
+    _check(chosen, num_episodes, "episode")
+    return tuple(chosen)
+
+
+def task_indices(tasks: Any, names: Sequence[str]) -> tuple[int, ...]:
+    """Tasks as ``vecenv.make`` takes them: None for all, a text as for ``parse_tasks``, an index, or several of either.
+
+    Raises:
+        PlacementError: something that is neither, or a task that does not exist or is not the only one of its name.
+    """
+    if tasks is None or isinstance(tasks, str):
+        return parse_tasks(ALL if tasks is None else tasks, len(names), names)
+    chosen: list[int] = []
+    for task in [tasks] if isinstance(tasks, Mapping) else tasks if isinstance(tasks, Iterable) else [tasks]:
+        chosen += parse_tasks(task, len(names), names) if isinstance(task, str) else _ints(task, "task")
+    _check(chosen, len(names), "task")
+    return tuple(chosen)
+
+
+def cross(tasks: Any, episodes: Any, *, num_tasks: int, num_episodes: int, every: int | None = None) -> Placement:
     """Every episode of every task, task by task.
 
     Args:
         tasks: one index or several.
-        episodes: one index or several, for all tasks; or a mapping task -> indices.
+        episodes: for all tasks, as for ``episode_indices``; or a mapping task -> such.
         num_tasks, num_episodes: how many there are.
+        every: how many episodes ``"all"`` are, where a protocol has fewer.
 
     Raises:
         PlacementError: an index that does not exist, or nothing to place.
@@ -60,9 +148,8 @@ def cross(tasks: Any, episodes: Any, *, num_tasks: int, num_episodes: int) -> Pl
     _check(task_list, num_tasks, "task")
     pairs: list[tuple[int, int]] = []
     for task in task_list:
-        chosen = _ints(episodes.get(task, ()) if isinstance(episodes, Mapping) else episodes, "episode")
-        _check(chosen, num_episodes, "episode")
-        pairs += [(task, episode) for episode in chosen]
+        spec = episodes.get(task, ()) if isinstance(episodes, Mapping) else episodes
+        pairs += [(task, episode) for episode in episode_indices(spec, num_episodes, every)]
     if not pairs:
         raise PlacementError("no slot to fill: tasks or episodes are empty")
     columns = np.array(pairs)
@@ -91,3 +178,50 @@ def each(tasks: Any, episodes: Any, current: Placement, *, num_tasks: int, num_e
             )
         columns.append(np.broadcast_to(np.array(chosen), len(current)).copy())
     return Placement(*columns)
+
+
+def _parse_indices(spec: str, count: int, what: str, names: Sequence[str] = ()) -> tuple[int, ...]:
+    parts = [part.strip() for part in spec.split(",") if part.strip()]
+    if not parts:
+        raise SpecError(f"no {what} named in {spec!r}")
+    indices = [index for part in parts for index in _parse_part(part, count, what, names)]
+    return tuple(dict.fromkeys(indices))
+
+
+def _parse_part(part: str, count: int, what: str, names: Sequence[str]) -> Sequence[int]:
+    if part in names:
+        return (names.index(part),)
+    return _parse_range(part, count, what) if _RANGE.fullmatch(part) else (_named(part, what, names),)
+
+
+def _parse_range(part: str, count: int, what: str) -> range:
+    low, _, high = part.partition("-")
+    start, stop = int(low), int(high or low)
+    if stop < start:
+        raise SpecError(f"the range {part!r} of {what}s runs backwards")
+    if stop >= count:
+        raise SpecError(f"there is no {what} {stop}: the last one is {count - 1}")
+    return range(start, stop + 1)
+
+
+def _named(part: str, what: str, names: Sequence[str]) -> int:
+    """The only one of the names that has this part."""
+    wanted = _plain(part)
+    fitting = [name for name in names if _plain(name) == wanted] or [name for name in names if wanted in _plain(name)]
+    if len(fitting) == 1:
+        return names.index(fitting[0])
+    if fitting:
+        raise SpecError(f"{what} {part!r} fits {len(fitting)}: {', '.join(_some(fitting))}; write more of the name")
+    near = difflib.get_close_matches(part, names, n=3) or list(names)
+    close = f"; did you mean {', '.join(_some(near))}?" if near else ""
+    raise SpecError(f"cannot read {part!r} as {what}s: write indices and ranges such as 0,3,5-7, or 'all'{close}")
+
+
+def _plain(name: str) -> str:
+    return "_".join(name.lower().split())
+
+
+def _some(names: Sequence[str]) -> Iterator[str]:
+    yield from names[:_LISTED]
+    if len(names) > _LISTED:
+        yield f"... ({len(names) - _LISTED} more)"

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from vecenv import actions as action_space
-from vecenv.contract import Control, EePoseControl, Metrics, PlanControl, ResetInfo
+from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo
 from vecenv.controllers.waypoint import Plan
 from vecenv.placement import Placement
 
@@ -30,13 +30,15 @@ class SlotBatch(ABC):
     Args:
         suite: the suite the tasks are of.
         num_envs: slots, B.
+        success: ``"first"`` ends an episode when its goal first holds; ``"final"`` goes on until the budget is spent.
     """
 
     # What calls that cannot be honoured raise.
     _error: ClassVar[type[ValueError]]
 
-    def __init__(self, suite: str, num_envs: int) -> None:
+    def __init__(self, suite: str, num_envs: int, *, success: str = FIRST) -> None:
         self.suite, self.num_envs = suite, num_envs
+        self._until_success = success == FIRST
         self._closed = False
         self._watchers: list[Watcher] = []
 
@@ -114,6 +116,7 @@ class SlotBatch(ABC):
         self._terminated = np.zeros(b, bool)
         self._truncated = np.zeros(b, bool)
         self._success = np.zeros(b, bool)
+        self._solved = np.zeros(b, bool)
         self._steps = np.zeros(b, int)
         self._reward = np.zeros(b)
         self._fault = [""] * b
@@ -142,7 +145,7 @@ class SlotBatch(ABC):
         )
 
     def _begin(self, stale: np.ndarray) -> None:
-        for array in (self._terminated, self._truncated, self._success, self._steps, self._reward):
+        for array in (self._terminated, self._truncated, self._success, self._solved, self._steps, self._reward):
             array[stale] = 0
         for slot in np.flatnonzero(stale):
             self._fault[slot] = ""
@@ -228,16 +231,28 @@ class SlotBatch(ABC):
         finally:
             self._watchers.remove(watcher)
 
-    def _book(self, ticks: np.ndarray, success: np.ndarray) -> np.ndarray:
-        """Enter how many ticks each slot took, int or bool [B], and the verdict after them; returns its rewards [B]."""
+    def _book(self, ticks: np.ndarray, success: np.ndarray, solved: np.ndarray | None = None) -> np.ndarray:
+        """Enter what each slot did.
+
+        Args:
+            ticks: how many it took, int or bool [B].
+            success: whether its goal held after the last of them, bool [B].
+            solved: whether its goal held after any of them, bool [B]; as ``success`` where each took one at most.
+
+        Returns:
+            Rewards, [B]: 1 where the goal held for the first time in the episode.
+        """
         active = ticks > 0
         self._steps += ticks
+        spent = active & (self._steps >= self._max_steps)
+        before = self._solved.copy()
         self._success[active] = success[active]
-        self._terminated |= active & success
-        self._truncated |= active & ~success & (self._steps >= self._max_steps)
+        self._solved |= active & (success if solved is None else solved)
+        self._terminated |= success & (active if self._until_success else spent)
+        self._truncated |= spent & ~success
         self._quarantine(active)
         # A slot that failed on its way to success has none, and earns nothing.
-        reward = np.where(active & self._success, 1.0, 0.0)
+        reward = np.where(self._solved & ~before, 1.0, 0.0)
         self._reward += reward
         return reward
 
@@ -246,7 +261,7 @@ class SlotBatch(ABC):
             if among[slot] and not self._fault[slot]:
                 self._fault[slot] = reason
                 self._truncated[slot] = True
-                self._terminated[slot] = self._success[slot] = False
+                self._terminated[slot] = self._success[slot] = self._solved[slot] = False
 
     def _control(
         self, kind: type[_Kind], reward: np.ndarray, before: np.ndarray, mended: np.ndarray | None = None, **extra: Any
@@ -279,6 +294,8 @@ class SlotBatch(ABC):
             suite=self.suite,
             task_id=self._placement.task.copy(),
             cumulative_reward=self._reward.copy(),
+            success_first=self._solved.copy(),
+            success_final=self._success.copy(),
         )
 
     @property

@@ -39,7 +39,7 @@ from vecenv.libero.scene import Entity, RegionSite, Scene, SceneSource, scene_so
 
 VARIABLE = "VECENV_CACHE_DIR"
 # Layout of the two files; raised when it changes.
-FORMAT = 1
+FORMAT = 2
 
 # Elements are written with double quotes, which are escaped within.
 _FILE = re.compile(r' file="([^"]*)"')

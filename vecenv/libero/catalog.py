@@ -1,12 +1,14 @@
-"""What LIBERO knows about an object category beyond its MJCF file: where the file lies, when a joint counts as open.
+"""What LIBERO knows about a category beyond its MJCF file: where that lies, when a joint is open, how resets turn it.
 
 Facts from ``libero/envs/objects``. Joint positions are metres for drawers and radians for doors and knobs.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 _FAMILIES = ("stable_hope_objects", "stable_scanned_objects", "turbosquid_objects", "custom_objects")
 # Categories whose file is not named after them.
@@ -104,6 +106,68 @@ ARTICULATIONS: dict[str, Articulation] = {
 def articulation(category: str) -> Articulation:
     """The joint semantics of a category; an empty one for things without joints."""
     return ARTICULATIONS.get(category.lower(), Articulation())
+
+
+Turn: TypeAlias = tuple[str, float, float]
+"""An axis and the bounds of a uniform draw of the angle about it, radians."""
+
+_UPRIGHT: tuple[Turn, ...] = (("x", math.pi / 2, math.pi / 2),)
+_AS_MODELLED: tuple[Turn, ...] = (("x", 0.0, 0.0),)
+_ABOUT_Z: tuple[Turn, ...] = (("z", math.pi / 2, math.pi / 2),)
+_FORWARD: tuple[Turn, ...] = (("x", -math.pi / 2, -math.pi / 2),)
+_TILTED: tuple[Turn, ...] = (("x", math.pi / 4, math.pi / 2),)
+
+# How upstream's samplers turn objects (``rotation`` and ``rotation_axis`` of the classes in libero/envs/objects).
+TURNS: dict[str, tuple[Turn, ...]] = {
+    **dict.fromkeys(
+        (
+            *("akita_black_bowl", "basket", "bbq_sauce", "bigger_akita_black_bowl", "black_bowl", "chefmate_8_frypan"),
+            *("cookies", "glazed_rim_porcelain_ramekin", "green_bbq_sauce", "plate", "red_akita_black_bowl"),
+            *("red_basket", "red_ramekin", "white_bowl", "yellow_bowl", "yellow_cookies", "yellow_plate"),
+        ),
+        _UPRIGHT,
+    ),
+    **dict.fromkeys(
+        (
+            *("alphabet_soup", "bigger_alphabet_soup", "bigger_milk", "blue_ketchup", "red_alphabet_soup"),
+            *("tomato_sauce", "yellow_milk", "yellow_tomato_sauce"),
+        ),
+        _ABOUT_Z,
+    ),
+    **dict.fromkeys(
+        (
+            *("basin_faucet", "faucet", "microwave", "short_cabinet", "short_fridge", "slide_cabinet"),
+            *("white_cabinet", "window", "wooden_cabinet", "yellow_cabinet"),
+        ),
+        _TILTED,
+    ),
+    **dict.fromkeys(("black_book", "yellow_book"), (("x", -math.pi / 2, -math.pi / 4),)),
+    **dict.fromkeys(
+        (
+            *("bowl_drainer", "brown_rack", "butter", "chocolate_pudding", "cream_cheese", "desk_caddy"),
+            *("dining_set_group", "green_butter", "green_chocolate_pudding", "moka_pot", "popcorn", "rack"),
+            *("red_cream_cheese", "white_bottle", "wine_bottle", "wine_rack", "wine_rack_stand", "wooden_shelf"),
+            *("wooden_tray", "wooden_two_layer_shelf", "yellow_desk_caddy", "yellow_moka_pot"),
+        ),
+        _AS_MODELLED,
+    ),
+    **dict.fromkeys(("flat_stove", "white_storage_box", "yellow_stove"), (("y", 0.0, 0.0),)),
+    **dict.fromkeys(
+        (
+            *("green_ketchup", "ketchup", "macaroni_and_cheese", "milk", "new_salad_dressing", "orange_juice"),
+            *("red_orange_juice", "red_salad_dressing", "salad_dressing"),
+        ),
+        (*_UPRIGHT, *_ABOUT_Z),
+    ),
+    "libero_mug_yellow": (
+        ("x", -math.pi / 2, -math.pi / 2),
+        ("y", -math.pi, -math.pi),
+        ("z", math.pi, math.pi),
+    ),
+    **dict.fromkeys(
+        ("porcelain_mug", "red_coffee_mug", "red_yellow_book", "white_porcelain_mug", "white_yellow_mug"), _FORWARD
+    ),
+}
 
 
 def asset_file(category: str, assets_root: Path) -> Path:

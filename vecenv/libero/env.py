@@ -18,7 +18,10 @@ import numpy as np
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
+from vecenv import protocols
 from vecenv.contract import (
+    FIRST,
+    SUCCESS_MODES,
     Control,
     Egocentric,
     Objects,
@@ -45,6 +48,7 @@ from vecenv.physics import budgets
 from vecenv.physics.base import SETTLE_ACTION, SETTLE_TICKS, Group, Physics, Start
 from vecenv.physics.budgets import Budget
 from vecenv.physics.build import BACKENDS, make_physics
+from vecenv.protocols import DEFAULT, Protocol, ResetLoop, reset_loop
 from vecenv.render.eyes import Eyes, options_of
 from vecenv.render.options import RenderConfig, VisualOptions
 from vecenv.slots import SlotBatch
@@ -63,27 +67,33 @@ class LiberoConfig:
     """Options of a LIBERO batch.
 
     Attributes:
+        protocol: name of the evaluation protocol that the options come from, for the record; it decides nothing here.
         backend: ``"native"`` (MuJoCo on CPU threads, float64), ``"warp"`` (MJX on MuJoCo Warp: NVIDIA GPUs, or a CPU),
             ``"jax"`` (MJX in pure JAX: any device), or ``"mjx"`` (warp on CUDA, jax elsewhere).
         geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, fitted ones (``vecenv.libero.geometry``).
         contacts: ``"published"``, those of the MuJoCo that LIBERO's data and checkpoints come from, or ``"current"``,
             those of the installed one (``vecenv.libero.contacts``).
         budget: contact and constraint memory on MJX; None measures the scene once and remembers it.
-        fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), or name -> (pos [3] or [B, 3] in
-            metres, quat wxyz [4] or [B, 4]), world frame.
+        fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), ``"upstream"`` (as upstream draws them
+            in ``reset_loop``), or name -> (pos [3] or [B, 3] in metres, quat wxyz [4] or [B, 4]), world frame.
         start: ``"settled"``, the stored init states after ten idle ticks: under MuJoCo 3.3.0, shipped with the package,
             for fixtures at the centre; settled here, once, for fixtures elsewhere (``vecenv.libero.settling``). Or
             ``"raw"``, the stored init states followed by ``settle_steps``.
         settle_steps: for ``start="raw"``: control ticks with no motion and an opening gripper before an episode begins;
             they do not count.
         max_steps: step budget of an episode in control ticks.
-        seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode.
+        success: ``"first"``: an episode ends when its goal first holds; ``"final"``: at the end of its budget, where
+            the verdict is read.
+        seed: what ``fixtures="sampled"`` depends on, together with suite, task and episode; and for ``"upstream"``,
+            what an evaluation script gives to ``env.seed``.
+        reset_loop: how that script seeds and resets, for ``fixtures="upstream"``; also a mapping of its fields.
         num_threads: threads of the native backend; None for one a core.
         num_devices: GPUs (or other devices) that MJX spreads the slots over.
         render: size of camera images, level of detail, cameras of one's own.
         waypoint: tolerances and speeds of ``step_ee_pose``.
     """
 
+    protocol: str = DEFAULT
     backend: str = "native"
     geometry: str = "exact"
     contacts: Contacts = "published"
@@ -92,7 +102,9 @@ class LiberoConfig:
     start: str = "settled"
     settle_steps: int = SETTLE_TICKS
     max_steps: int = MAX_STEPS
+    success: str = FIRST
     seed: int = 0
+    reset_loop: ResetLoop | Mapping[str, Any] = field(default_factory=ResetLoop)
     num_threads: int | None = None
     num_devices: int = 1
     render: RenderConfig = field(default_factory=RenderConfig)
@@ -104,13 +116,23 @@ class LiberoConfig:
             ("geometry", PROFILES),
             ("contacts", CONTACTS),
             ("start", ("settled", "raw")),
+            ("success", SUCCESS_MODES),
         ):
             if getattr(self, name) not in allowed:
                 raise LiberoError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
+        object.__setattr__(self, "reset_loop", reset_loop(self.reset_loop))
+        if self.fixtures == "upstream":
+            self.loop.at(self.seed, 0, 0)  # a seed that upstream does not take is refused before anything is built
         if self.settle_steps < 0 or self.max_steps < 1:
             raise LiberoError(f"settle_steps={self.settle_steps}, max_steps={self.max_steps}: need >= 0 and >= 1")
         if self.num_threads is not None and self.num_threads < 1:
             raise LiberoError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
+
+    @property
+    def loop(self) -> ResetLoop:
+        """``reset_loop`` as what it became."""
+        assert isinstance(self.reset_loop, ResetLoop)
+        return self.reset_loop
 
 
 def _joined(starts: Sequence[Start]) -> Start:
@@ -157,7 +179,7 @@ class LiberoEnv(SlotBatch):
     _error = LiberoError
 
     def __init__(self, suite: str, tasks: Sequence[Task], placement: placing.Placement, config: LiberoConfig) -> None:
-        super().__init__(suite, len(placement))
+        super().__init__(suite, len(placement), success=config.success)
         self.config = config
         self._sources = tasks
         self._physics: Physics | None = None
@@ -184,7 +206,8 @@ class LiberoEnv(SlotBatch):
 
     def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
         counts = {"num_tasks": len(self._sources), "num_episodes": NUM_EPISODES}
-        return placing.each(tasks, episodes, self._placement, **counts)
+        indices = None if tasks is None else placing.task_indices(tasks, [source.name for source in self._sources])
+        return placing.each(indices, episodes, self._placement, **counts)
 
     def _prepare(self) -> np.ndarray:
         """Scenes, physics and goal tables for the current placement; what still fits is kept."""
@@ -286,6 +309,7 @@ class LiberoEnv(SlotBatch):
             self.config.fixtures,
             keys=[(self.config.seed, self.suite, task, int(episode)) for episode in episodes],
             slots=slots.tolist(),
+            loop=self.config.loop,
         )
         settled = self.config.start == "settled" and self.config.fixtures == "center"
         start = Start(
@@ -342,8 +366,9 @@ class LiberoEnv(SlotBatch):
         self._check_live()
         chunk, mended = action_space.continuous(actions, self.num_envs)
         before = self._steps.copy()
-        ran = self.physics.run(chunk, ~self._done, self._ticks_left, self._watchers)
-        return self._control(Control, self._book(ran.ticks, ran.success), before, mended)
+        until = self._until_success
+        ran = self.physics.run(chunk, ~self._done, self._ticks_left, self._watchers, until_success=until)
+        return self._control(Control, self._book(ran.ticks, ran.success, ran.solved), before, mended)
 
     @property
     def _ticks_left(self) -> np.ndarray:
@@ -366,8 +391,10 @@ class LiberoEnv(SlotBatch):
             self.config.waypoint,
             max_misses=max_misses,
             watchers=self._watchers,
+            until_success=self._until_success,
         )
-        return self._book(followed.ticks, followed.success), followed.converged, followed.waypoint_ticks
+        reward = self._book(followed.ticks, followed.success, followed.solved)
+        return reward, followed.converged, followed.waypoint_ticks
 
     def _tools(self) -> np.ndarray:
         return np.concatenate(self.physics.eef(), axis=1)
@@ -668,17 +695,27 @@ def make(
     tasks: Any = None,
     episodes: Any = None,
     scenes: str | Path | None = None,
+    protocol: Protocol | None = None,
     **options: Any,
 ) -> LiberoEnv:
-    """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments."""
+    """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments.
+
+    Args:
+        protocol: says how many episodes there are and how large images are, where that is not given; this project's
+            own when left out.
+    """
+    protocol = protocol or protocols.protocol(DEFAULT)
     sources = installed_tasks(suite) if scenes is None else exported_tasks(scenes, suite)
     if task is not None and tasks is not None:
         raise LiberoError("give task or tasks, not both")
-    chosen = tasks if task is None else task
+    names = [source.name for source in sources]
     placement = placing.cross(
-        range(len(sources)) if chosen is None else chosen,
-        range(NUM_EPISODES) if episodes is None else episodes,
+        placing.task_indices(tasks if task is None else task, names),
+        episodes,
         num_tasks=len(sources),
         num_episodes=NUM_EPISODES,
+        every=protocol.episodes,
     )
-    return LiberoEnv(suite, sources, placement, LiberoConfig(**options))
+    if "render" not in options and protocol.image_size is not None:
+        options["render"] = RenderConfig(height=protocol.image_size, width=protocol.image_size)
+    return LiberoEnv(suite, sources, placement, LiberoConfig(protocol=protocol.name, **options))

@@ -1,7 +1,8 @@
 """Where fixtures stand: stored init states don't say, so it is an input of every slot.
 
 LIBERO draws each fixture's x, y and yaw from its BDDL region at every reset, from NumPy's global generator. Here the
-poses are explicit: the region's centre, a draw that depends only on (seed, suite, task, episode), or given by the user.
+poses are explicit: the region's centre, a draw that depends only on (seed, suite, task, episode), what upstream draws
+in an evaluation script's loop (``vecenv.libero.resets``), or given by the user.
 """
 
 from __future__ import annotations
@@ -13,8 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from vecenv.libero import resets
 from vecenv.libero.bddl import Problem, Region
 from vecenv.libero.scene import Entity, Scene
+from vecenv.protocols import ResetLoop
+
+MODES = ("center", "sampled", "upstream")
 
 
 class FixtureError(ValueError):
@@ -81,21 +86,24 @@ def poses(
     *,
     keys: Sequence[tuple[int, str, int, int]],
     slots: Sequence[int],
+    loop: ResetLoop | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Root body poses of every fixture in n slots of one task.
 
     Args:
         problem, scene: the task and its compiled scene.
-        fixtures: ``"center"``, ``"sampled"``, or a mapping name -> (pos, quat) with pos [3] or [B, 3] in metres and
-            quat wxyz [4] or [B, 4], world frame; fixtures not named stay at their region's centre.
-        keys: (seed, suite, task, episode) of each slot, what ``"sampled"`` depends on.
+        fixtures: ``"center"``, ``"sampled"``, ``"upstream"``, or a mapping name -> (pos, quat) with pos [3] or [B, 3]
+            in metres and quat wxyz [4] or [B, 4], world frame; fixtures not named stay at their region's centre.
+        keys: (seed, suite, task, episode) of each slot, what ``"sampled"`` and ``"upstream"`` depend on.
         slots: index of each slot in the batch, which row of a [B, ...] pose it gets.
+        loop: how ``"upstream"`` seeds and resets; the loop of OpenVLA and openpi when not given.
 
     Returns:
         body ids [F], positions [n, F, 3] in metres, quaternions wxyz [n, F, 4].
 
     Raises:
         FixtureError: unknown mode or fixture name, or an array that is no pose.
+        ResetError, ProtocolError: ``"upstream"`` of what upstream cannot reset, or of a seed it does not take.
     """
     known = placements(problem, scene)
     given = _given(fixtures, scene)
@@ -103,12 +111,16 @@ def poses(
     bodies = np.array([scene.model.body(scene.entities[name].root_body).id for name in names], int)
     pos = np.zeros((len(slots), len(names), 3))
     quat = np.zeros((len(slots), len(names), 4))
+    drawn = _upstream(problem, scene, keys, loop or ResetLoop()) if fixtures == "upstream" else []
     for column, name in enumerate(names):
         if name in given:
             pos[:, column], quat[:, column] = _rows(name, *given[name], slots)
         elif fixtures == "sampled":
             for row, key in enumerate(keys):
                 pos[row, column], quat[row, column] = _sample(known[name], name, key)
+        elif fixtures == "upstream":
+            for row, placed in enumerate(drawn):
+                pos[row, column], quat[row, column] = placed[name]
         else:
             pos[:, column], quat[:, column] = known[name].pose(np.full(3, 0.5))
     return bodies, pos, quat
@@ -118,6 +130,13 @@ def _sample(placement: FixturePlacement, name: str, key: tuple[int, str, int, in
     seed, suite, task, episode = key
     rng = np.random.default_rng([seed, zlib.crc32(suite.encode()), task, episode, zlib.crc32(name.encode())])
     return placement.pose(rng.uniform(size=3), int(rng.integers(len(placement.ranges))))
+
+
+def _upstream(
+    problem: Problem, scene: Scene, keys: Sequence[tuple[int, str, int, int]], loop: ResetLoop
+) -> list[dict[str, resets.Pose]]:
+    points = [loop.at(int(seed), int(task), int(episode)) for seed, _, task, episode in keys]
+    return resets.placed_at(problem, scene, points)
 
 
 def _given(fixtures: str | Mapping[str, Any], scene: Scene) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -137,8 +156,9 @@ def _mapping(fixtures: str | Mapping[str, Any]) -> Mapping[str, Any]:
     """The poses that the caller gives; none for a mode."""
     if isinstance(fixtures, Mapping):
         return fixtures
-    if fixtures not in ("center", "sampled"):
-        raise FixtureError(f"fixtures={fixtures!r}: expected 'center', 'sampled' or a mapping name -> (pos, quat)")
+    if fixtures not in MODES:
+        modes = ", ".join(map(repr, MODES))
+        raise FixtureError(f"fixtures={fixtures!r}: expected {modes} or a mapping name -> (pos, quat)")
     return {}
 
 

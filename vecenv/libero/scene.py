@@ -79,7 +79,8 @@ class Entity:
         root_body: name of its root body.
         joints: its joints in upstream's order, the free joint of a movable object included.
         contact_geoms: names of the geoms that upstream's contact tests look at.
-        bottom_z: height of the file's ``bottom_site`` relative to the root body, metres.
+        bottom_z, top_z: heights of the file's ``bottom_site`` and ``top_site`` relative to the root body, metres.
+        radius: x of the file's ``horizontal_radius_site``, metres: how far apart upstream's samplers keep things.
     """
 
     name: str
@@ -89,6 +90,8 @@ class Entity:
     joints: tuple[str, ...]
     contact_geoms: tuple[str, ...]
     bottom_z: float
+    top_z: float
+    radius: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,7 +309,6 @@ class _Builder:
         source = mjcf.load(path)
         tree = mjcf.object_subtree(source, name, free=not fixture, path=path)
         mjcf.add_prefix(mjcf.section(source, "asset"), f"{name}_")
-        bottom = source.find("worldbody/body/site[@name='bottom_site']")
         self.entities[name] = Entity(
             name=name,
             category=category,
@@ -314,7 +316,9 @@ class _Builder:
             root_body=tree.attrib["name"],
             joints=tuple(joint.attrib["name"] for joint in tree.iter("joint")),
             contact_geoms=tuple(g.attrib["name"] for g in tree.iter("geom") if g.get("group", "0") == "0"),
-            bottom_z=0.0 if bottom is None else mjcf.numbers(bottom.attrib["pos"])[2],
+            bottom_z=_outer_site(source, "bottom_site")[2],
+            top_z=_outer_site(source, "top_site")[2],
+            radius=_outer_site(source, "horizontal_radius_site")[0],
         )
         return tree, source
 
@@ -384,6 +388,12 @@ def _find_region_site(tree: ET.Element, name: str, entity: str) -> RegionSite | 
                     body=part.attrib["name"],
                 )
     return found
+
+
+def _outer_site(source: ET.Element, name: str) -> tuple[float, float, float]:
+    """Position of a site beside an object's body, which tells its extent; zeros where the file has none."""
+    site = source.find(f"worldbody/body/site[@name='{name}']")
+    return (0.0, 0.0, 0.0) if site is None else _vec3(site.attrib["pos"])
 
 
 def _vec3(text: str) -> tuple[float, float, float]:

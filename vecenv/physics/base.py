@@ -136,17 +136,19 @@ class Group(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Ran:
     """What ``run`` and ``follow`` did.
 
     Attributes:
         ticks: control steps each slot took, int [B].
         success: slots whose goal held after their last tick, bool [B].
+        solved: slots whose goal held after one of their ticks, bool [B].
     """
 
     ticks: np.ndarray
     success: np.ndarray
+    solved: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +254,15 @@ class Physics(ABC):
             quat[group.slots] = group.xquat[:, group.scene.hand_body]
         return waypoint.Pose(pos, quat)
 
-    def run(self, chunk: np.ndarray, active: np.ndarray, limit: np.ndarray, watchers: Sequence[Watcher] = ()) -> Ran:
+    def run(
+        self,
+        chunk: np.ndarray,
+        active: np.ndarray,
+        limit: np.ndarray,
+        watchers: Sequence[Watcher] = (),
+        *,
+        until_success: bool = True,
+    ) -> Ran:
         """Execute a chunk of actions; a slot stops at its own success, fault or limit.
 
         Args:
@@ -260,12 +270,13 @@ class Physics(ABC):
             active: slots that take part, bool [B].
             limit: control steps each slot may still take, int [B].
             watchers: called with the actions [B, 7] and the active slots, bool [B], before every tick.
+            until_success: False goes on after success.
         """
-        loop = _HostLoop(self, active, limit, watchers)
+        loop = _HostLoop(self, active, limit, watchers, until_success)
         for k in range(chunk.shape[1]):
             if not loop.tick(chunk[:, k]).any():
                 break
-        return Ran(ticks=loop.ticks, success=loop.success)
+        return Ran(ticks=loop.ticks, success=loop.success, solved=loop.solved)
 
     def follow(
         self,
@@ -276,6 +287,7 @@ class Physics(ABC):
         *,
         max_misses: int | None = None,
         watchers: Sequence[Watcher] = (),
+        until_success: bool = True,
     ) -> Followed:
         """Follow plans; a slot stops at the end of its plan and at its own success, fault or limit.
 
@@ -285,10 +297,10 @@ class Physics(ABC):
             limit: control steps each slot may still take, int [B].
             config: tolerances and speeds.
             max_misses: give a slot up after this many waypoints in a row that ran out of ticks; None never does.
-            watchers: as for ``run``.
+            watchers, until_success: as for ``run``.
         """
         follower = _follower(config)
-        loop = _HostLoop(self, active, limit, watchers)
+        loop = _HostLoop(self, active, limit, watchers, until_success)
         progress = follower.begin(plan, self.eef())
         while True:
             going = np.asarray(progress.index) < plan.valid.shape[1]
@@ -302,6 +314,7 @@ class Physics(ABC):
         return Followed(
             ticks=loop.ticks,
             success=loop.success,
+            solved=loop.solved,
             converged=np.asarray(progress.converged),
             waypoint_ticks=np.asarray(progress.ticks),
         )
@@ -310,12 +323,20 @@ class Physics(ABC):
 class _HostLoop:
     """Ticks of a batch whose slots stop one by one."""
 
-    def __init__(self, physics: Physics, active: np.ndarray, limit: np.ndarray, watchers: Sequence[Watcher]) -> None:
+    def __init__(
+        self,
+        physics: Physics,
+        active: np.ndarray,
+        limit: np.ndarray,
+        watchers: Sequence[Watcher],
+        until_success: bool,
+    ) -> None:
         self._physics, self._watchers = physics, watchers
-        self._limit = limit
+        self._limit, self._until_success = limit, until_success
         self.going = active & (limit > 0)
         self.ticks = np.zeros(len(active), int)
         self.success = np.zeros(len(active), bool)
+        self.solved = np.zeros(len(active), bool)
 
     def tick(self, actions: np.ndarray, also: np.ndarray | None = None) -> np.ndarray:
         """One control step of the slots that are still going (and in ``also``); returns which those were."""
@@ -328,8 +349,11 @@ class _HostLoop:
         self.ticks[moved] += 1
         healthy = moved.copy()
         healthy[list(self._physics.faults)] = False
-        self.success |= self._physics.judge() & healthy
-        self.going = self.going & ~self.success & (self.ticks < self._limit)
+        self.success[moved] = (self._physics.judge() & healthy)[moved]
+        self.solved |= self.success
+        self.going = self.going & (self.ticks < self._limit)
+        if self._until_success:
+            self.going &= ~self.solved
         self.going[list(self._physics.faults)] = False
         return moved
 

@@ -517,33 +517,49 @@ class Loop(NamedTuple):
         going: worlds that still move, bool [n].
         ticks: control steps taken, int [n].
         success: goal held after the last tick, bool [n].
+        solved: goal held after one of the ticks, bool [n].
     """
 
     worlds: World
     going: jax.Array
     ticks: jax.Array
     success: jax.Array
+    solved: jax.Array
 
 
 def _tick(
-    system: System, table: goals.GoalTable, limit: jax.Array, loop: Loop, actions: jax.Array, moved: jax.Array
+    system: System,
+    table: goals.GoalTable,
+    limit: jax.Array,
+    loop: Loop,
+    actions: jax.Array,
+    moved: jax.Array,
+    until_success: bool,
 ) -> Loop:
     worlds = jax.vmap(control_step, in_axes=(None, 0, 0, 0))(system, loop.worlds, actions, moved)
     healthy = worlds.fault == 0
-    success = loop.success | (jax.vmap(judge)(worlds, table) & moved & healthy)
-    ticks = loop.ticks + moved
-    return Loop(worlds, loop.going & healthy & ~success & (ticks < limit), ticks, success)
+    success = jnp.where(moved, jax.vmap(judge)(worlds, table) & healthy, loop.success)
+    solved, ticks = loop.solved | success, loop.ticks + moved
+    going = loop.going & healthy & (ticks < limit)
+    return Loop(worlds, going & ~solved if until_success else going, ticks, success, solved)
 
 
 def _begin(worlds: World, active: jax.Array, limit: jax.Array) -> Loop:
     none = jnp.zeros(active.shape, jnp.int32)
-    return Loop(worlds, active & (limit > 0), none, jnp.zeros(active.shape, bool))
+    return Loop(worlds, active & (limit > 0), none, jnp.zeros(active.shape, bool), jnp.zeros(active.shape, bool))
 
 
 def run_chunk(
-    system: System, table: goals.GoalTable, worlds: World, chunk: jax.Array, active: jax.Array, limit: jax.Array
+    system: System,
+    table: goals.GoalTable,
+    worlds: World,
+    chunk: jax.Array,
+    active: jax.Array,
+    limit: jax.Array,
+    *,
+    until_success: bool = True,
 ) -> Loop:
-    """Execute a chunk of actions, [n, K, 7]; a world stops at its own success, fault or limit.
+    """Execute a chunk of actions, [n, K, 7]; a world stops at its own success (or not), fault or limit.
 
     Stops as a whole when no world moves any more.
     """
@@ -553,7 +569,7 @@ def run_chunk(
 
     def body(carry: tuple[Loop, jax.Array]) -> tuple[Loop, jax.Array]:
         loop, k = carry
-        return _tick(system, table, limit, loop, chunk[:, k], loop.going), k + 1
+        return _tick(system, table, limit, loop, chunk[:, k], loop.going, until_success), k + 1
 
     return lax.while_loop(running, body, (_begin(worlds, active, limit), jnp.zeros((), jnp.int32)))[0]
 
@@ -577,6 +593,7 @@ def follow_plan(
     sites: tuple[int, int],
     config: waypoint.WaypointConfig,
     traced: int = 0,
+    until_success: bool = True,
 ) -> tuple[Loop, waypoint.Progress, Trace]:
     """Follow plans of waypoints; a world stops at the end of its plan, and at its own success, fault or limit.
 
@@ -591,6 +608,7 @@ def follow_plan(
         sites: ids of the grip site and the hand body.
         config: tolerances and speeds.
         traced: ticks to record.
+        until_success: False goes on after success.
     """
     current = eef(worlds, *sites)
     progress = waypoint.begin_plan(plan, current)
@@ -603,7 +621,7 @@ def follow_plan(
         loop, progress, trace, count = carry
         moved = moving(loop, progress)
         actions, progress = waypoint.plan_action(plan, progress, eef(loop.worlds, *sites), config)
-        loop = _tick(system, table, limit, loop, actions, moved)
+        loop = _tick(system, table, limit, loop, actions, moved, until_success)
         progress = waypoint.plan_advance(plan, progress, eef(loop.worlds, *sites), moved, config)
         if traced:
             trace = Trace(trace.actions.at[:, count].set(actions), trace.moved.at[:, count].set(moved))
@@ -636,14 +654,22 @@ class _Compiled:
         self.start = self._compile(_start)
         self.write = self._compile(_write)
         self.forward = self._compile(jax.vmap(forward, in_axes=(None, 0)))
-        self.run = self._compile(run_chunk, donate_argnums=(2,))
+        self._run = {
+            mode: self._compile(functools.partial(run_chunk, until_success=mode), donate_argnums=(2,))
+            for mode in (True, False)
+        }
         self._follow: dict[Any, Callable[..., Any]] = {}
 
-    def follow(self, config: waypoint.WaypointConfig, traced: int) -> Callable[..., Any]:
+    def run(self, until_success: bool) -> Callable[..., Any]:
+        """``run_chunk``, which ends at success or not; each is compiled when it is first called."""
+        return self._run[until_success]
+
+    def follow(self, config: waypoint.WaypointConfig, traced: int, until_success: bool) -> Callable[..., Any]:
         """``follow_plan`` with these settings."""
-        key = (config, traced)
+        key = (config, traced, until_success)
         if key not in self._follow:
-            function = functools.partial(_follow, sites=self._sites, config=config, traced=traced)
+            settings = {"config": config, "traced": traced, "until_success": until_success}
+            function = functools.partial(_follow, sites=self._sites, **settings)
             self._follow[key] = self._compile(function, shared=2, donate_argnums=(3,))
         return self._follow[key]
 
@@ -895,7 +921,15 @@ class MjxPhysics(Physics):
         """Advance the active slots by one control step: 25 substeps, 50 ms."""
         self.run(actions[:, None], active, np.ones(self.num_envs, int))
 
-    def run(self, chunk: np.ndarray, active: np.ndarray, limit: np.ndarray, watchers: Sequence[Watcher] = ()) -> Ran:
+    def run(
+        self,
+        chunk: np.ndarray,
+        active: np.ndarray,
+        limit: np.ndarray,
+        watchers: Sequence[Watcher] = (),
+        *,
+        until_success: bool = True,
+    ) -> Ran:
         """Execute a chunk of actions in one compiled call a scene; see ``Physics.run``.
 
         Watchers are called afterwards, in the order of the ticks.
@@ -903,7 +937,7 @@ class MjxPhysics(Physics):
 
         def call(group: MjxGroup) -> tuple[Loop, None]:
             rows = group.put(chunk[group.slots]), group.put_mask(active[group.slots]), group.put(limit[group.slots])
-            return group.compiled.run(group.system, _table(group), group.worlds, *rows), None
+            return group.compiled.run(until_success)(group.system, _table(group), group.worlds, *rows), None
 
         ran, _ = self._each(active, call)
         for k in range(chunk.shape[1]):
@@ -921,6 +955,7 @@ class MjxPhysics(Physics):
         *,
         max_misses: int | None = None,
         watchers: Sequence[Watcher] = (),
+        until_success: bool = True,
     ) -> Followed:
         """Follow plans in one compiled call a scene; see ``Physics.follow``.
 
@@ -933,7 +968,7 @@ class MjxPhysics(Physics):
         def call(group: MjxGroup) -> tuple[Loop, Any]:
             own = jax.tree.map(lambda x: group.put(np.asarray(x)[group.slots]), plan)
             rows = own, group.put_mask(active[group.slots]), group.put(limit[group.slots])
-            follow = group.compiled.follow(config, traced)
+            follow = group.compiled.follow(config, traced, until_success)
             loop, *rest = follow(group.system, misses, _table(group), group.worlds, *rows)
             return loop, rest
 
@@ -943,17 +978,18 @@ class MjxPhysics(Physics):
         for group, (progress, _) in results:
             converged[group.slots], ticks[group.slots] = group.get(progress.converged), group.get(progress.ticks)
         _replay(watchers, traced, self.num_envs, [(group, trace) for group, (_, trace) in results])
-        return Followed(ticks=ran.ticks, success=ran.success, converged=converged, waypoint_ticks=ticks)
+        return Followed(**vars(ran), converged=converged, waypoint_ticks=ticks)
 
     def _each(self, active: np.ndarray, call: Callable[[MjxGroup], Any]) -> tuple[Ran, list[tuple[MjxGroup, Any]]]:
         """Call for every group with an active slot; all are under way before the first result is waited for."""
         calls = [(group, call(group)) for group in self._groups if active[group.slots].any()]
-        ticks, success = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
+        ran = Ran(*(np.zeros(self.num_envs, kind) for kind in (int, bool, bool)))
         for group, (loop, _) in calls:
             group.replace(loop.worlds)
-            ticks[group.slots], success[group.slots] = group.get(loop.ticks), group.get(loop.success)
+            for name, array in vars(ran).items():
+                array[group.slots] = group.get(getattr(loop, name))
         self._collect_faults()
-        return Ran(ticks=ticks, success=success), [(group, extra) for group, (_, extra) in calls]
+        return ran, [(group, extra) for group, (_, extra) in calls]
 
     def _collect_faults(self) -> None:
         for group in self._groups:

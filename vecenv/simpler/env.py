@@ -22,6 +22,8 @@ import numpy as np
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv.contract import (
+    FIRST,
+    SUCCESS_MODES,
     CameraView,
     Control,
     Egocentric,
@@ -80,6 +82,8 @@ class SimplerConfig:
         gripper: ``"native"``, the robot's own convention; or ``"binary"``, 1 closed and 0 open (above or below one
             half).
         max_steps: step budget in control ticks; None for each task's own.
+        success: ``"first"``: an episode ends when its task is first solved; ``"final"``: at the end of its budget,
+            where the verdict is read.
         servo: speeds and tolerances of ``step_ee_pose``; None for the suite's own.
         overlay: what replaces the background of pictures: ``"background"``, a photograph, as upstream's visual matching
             does; ``"none"``; or ``"blend"``, both at one half.
@@ -92,6 +96,7 @@ class SimplerConfig:
     num_workers: int | None = None
     gripper: str = "native"
     max_steps: int | None = None
+    success: str = FIRST
     servo: ServoConfig | None = None
     overlay: str = "background"
     shadows: bool = False
@@ -103,7 +108,12 @@ class SimplerConfig:
             raise SimplerError(_NO_CUDA)
         if self.backend == _NATIVE:
             object.__setattr__(self, "backend", BACKENDS[0])
-        for name, allowed in (("backend", BACKENDS), ("gripper", GRIPPERS), ("overlay", OVERLAYS)):
+        for name, allowed in (
+            ("backend", BACKENDS),
+            ("gripper", GRIPPERS),
+            ("overlay", OVERLAYS),
+            ("success", SUCCESS_MODES),
+        ):
             if getattr(self, name) not in allowed:
                 raise SimplerError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
         for name in ("num_workers", "max_steps"):
@@ -130,7 +140,7 @@ class SimplerEnv(SlotBatch):
     _error = SimplerError
 
     def __init__(self, suite: str, placement: placing.Placement, config: SimplerConfig) -> None:
-        super().__init__(suite, len(placement))
+        super().__init__(suite, len(placement), success=config.success)
         self.config = config
         self.tasks = list_tasks(suite)
         self.robot = self.tasks[0].robot
