@@ -107,11 +107,15 @@ class Stage:
         name: stem of its mesh among the stages, or None for a bare floor that is only drawn.
         offset: its origin is put at minus this, metres.
         table_height: objects are dropped from half a metre above, metres, world frame.
+        turn: pose of the mesh in the stage's frame, xyz and wxyz, not normalised (as upstream has it).
+        solid: whether it has collision shapes; the rooms around cabinets are only drawn.
     """
 
     name: str | None
     offset: tuple[float, float, float]
     table_height: float = 0.87
+    turn: tuple[float, ...] = (0.0, 0.0, 0.0, 0.707, 0.707, 0.0, 0.0)
+    solid: bool = True
 
     @property
     def mesh(self) -> PurePosixPath | None:
@@ -424,11 +428,11 @@ PLACE_MODELS = (
 )
 
 
-def _triplets(suffix: str) -> tuple[tuple[str, str, str], ...]:
+def _triplets(prefix: str, suffix: str = "") -> tuple[tuple[str, str, str], ...]:
     pepsi, seven_up, coke, redbull = (
-        f"baked_opened_{brand}_can{suffix}" for brand in ("pepsi", "7up", "coke", "redbull")
+        f"{prefix}opened_{brand}_can{suffix}" for brand in ("pepsi", "7up", "coke", "redbull")
     )
-    apple, sponge = f"baked_apple{suffix}", f"baked_sponge{suffix}"
+    apple, sponge = f"{prefix}apple{suffix}", f"{prefix}sponge{suffix}"
     return (
         ("blue_plastic_bottle", pepsi, "orange"),
         (seven_up, apple, sponge),
@@ -436,6 +440,12 @@ def _triplets(suffix: str) -> tuple[tuple[str, str, str], ...]:
         (sponge, "blue_plastic_bottle", seven_up),
         ("orange", pepsi, redbull),
     )
+
+
+PLAIN_TRIPLETS = _triplets("")
+"""Groups of ``move_near`` in variant aggregation: visual matching's without the light baked into their textures."""
+PLAIN_MODELS_FILE = "info_pick_custom_v0.json"
+"""Sizes and densities of the objects of ``pick`` and of those groups."""
 
 
 def _google(name: str, family: str, instruction: str, success: Success, **fields: Any) -> dict[str, Any]:
@@ -460,7 +470,7 @@ def _pick(name: str, instruction: str, models: tuple[str, ...], orientation: str
         max_steps=80,
         models=models,
         orientation=orientation,
-        models_file="info_pick_custom_v0.json",
+        models_file=PLAIN_MODELS_FILE,
         stage=COKE_TABLE,
         overlays=(_picture("google_coke_can_real_eval_1"),),
         lighting=TABLE_LIGHT,
@@ -474,7 +484,7 @@ def _move_near(name: str, version: int) -> dict[str, Any]:
         "move SOURCE near TARGET",
         MoveNearSuccess(),
         max_steps=80,
-        triplets=_triplets("" if version == 0 else "_v2"),
+        triplets=_triplets("baked_", "" if version == 0 else "_v2"),
         models_file=f"info_pick_custom_baked_tex_v{version}.json",
         stage=COKE_TABLE,
         contact_offset=0.005,
