@@ -652,18 +652,28 @@ def _by_name(suite: str, name: str, tasks: Iterable[SimplerTask]) -> SimplerTask
     return names[name]
 
 
-def eval_metadata(suite: str) -> dict[str, Any]:
+def eval_metadata(suite: str, protocol: str = "seed") -> dict[str, Any]:
     """What an evaluation of a suite consists of, with the keys of ``vecenv.eval_metadata``; budgets are a task's own.
+
+    Args:
+        suite: the suite.
+        protocol: one of ``published.PROTOCOLS``. Under upstream's lists ``episodes_per_task`` is a tuple, one number a
+            task, 0 where upstream has none.
 
     Raises:
         UnknownSuite: no such suite.
+        PublishedError: no such protocol, or it has no episodes of this suite.
     """
-    tasks = list_tasks(suite)
+    from vecenv.simpler import published  # it builds on this module
+
+    tasks, there = list_tasks(suite), published.counts(protocol, suite)
+    counts = tuple(there.get(task.index, 0) for task in tasks)
     return {
         "suite": suite,
+        "protocol": protocol,
         "num_tasks": len(tasks),
-        "episodes_per_task": NUM_EPISODES,
-        "num_episodes": len(tasks) * NUM_EPISODES,
+        "episodes_per_task": NUM_EPISODES if protocol == published.SEED else counts,
+        "num_episodes": sum(counts),
         "max_steps": tuple(task.max_steps for task in tasks),
         "metrics": ("success", "num_steps", "cumulative_reward"),
         "action_space": ("step_continuous", "step_ee_pose"),
