@@ -1,4 +1,5 @@
-"""Write ``vecenv/simpler/manifest.json``: the files that SIMPLER's tasks open, with their sizes and hashes.
+"""Write ``vecenv/simpler/manifest.json``: the files that SIMPLER's tasks open, with their sizes and hashes; and
+``manifest_variants.json``, those that only variant aggregation opens.
 
 In: an asset tree in the layout of ManiSkill2_real2sim, and a clone of that repository. Every file of the tree is
 listed, and must have the content that the repository's commit has at that path. What the tasks open but the tree lacks
@@ -19,7 +20,9 @@ import sys
 from pathlib import Path, PurePosixPath
 
 from vecenv.simpler import assets
-from vecenv.simpler.tasks import TASKS
+from vecenv.simpler.published import ROOMS
+from vecenv.simpler.tasks import COKE_TABLE, DATA, TASKS, Stage
+from vecenv.simpler.variants import STAGES
 
 COMMIT = "ef7a4d4fdf4b69f2c2154db5b15b9ac8dfe10682"
 # Objects that move_near and pick draw from a mesh in a file of this name; the others' are in the tree.
@@ -40,14 +43,27 @@ def main() -> None:
     parser.add_argument("--git", type=Path, required=True, help="clone of ManiSkill2_real2sim")
     parser.add_argument("--commit", default=COMMIT)
     parser.add_argument("--out", type=Path, default=assets.MANIFEST)
+    parser.add_argument("--variants", type=Path, default=assets.VARIANTS_MANIFEST)
     options = parser.parse_args()
     blobs = git_blobs(options.git, options.commit)
-    wanted: dict[str, str | None] = {**needed(blobs), **dict.fromkeys(files(options.tree))}
-    rows = [row(options, path, blobs, wanted[path]) for path in sorted(wanted)]
+    varied: dict[str, str | None] = dict.fromkeys(variant_files())
+    tasks = {**needed(blobs), **dict.fromkeys(path for path in files(options.tree) if path not in varied)}
+    for out, wanted in ((options.out, tasks), (options.variants, varied)):
+        write(out, options.commit, [row(options, path, blobs, wanted[path]) for path in sorted(wanted)])
+
+
+def write(out: Path, commit: str, rows: list[dict[str, str | int]]) -> None:
+    """A manifest, and a word about it."""
     lines = ",\n  ".join(json.dumps(entry) for entry in rows)
-    options.out.write_text(f'{{"commit": "{options.commit}", "files": [\n  {lines}\n]}}\n')
+    out.write_text(f'{{"commit": "{commit}", "files": [\n  {lines}\n]}}\n')
     absent = [str(entry["path"]) for entry in rows if "sha256" not in entry]
     print(f"{len(rows)} files, {len(absent)} of them only with Git's identifier:", *absent, sep="\n  ")
+
+
+def variant_files() -> list[str]:
+    """Tables and rooms of variant aggregation, and the mesh of one of its cabinets."""
+    tables = [Stage(name=name, offset=COKE_TABLE.offset) for name in STAGES]
+    return [*(str(stage.mesh) for stage in (*tables, *ROOMS.values())), f"{DATA}/custom/models/stone_tabletop.glb"]
 
 
 def files(tree: Path) -> list[str]:

@@ -10,18 +10,20 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.placement import PlacementError
+from vecenv.simpler.assets import VARIANTS_MANIFEST, assets_app, how_to_get, read_manifest
 from vecenv.simpler.layouts import LayoutError, episode_layout, episode_seed, lay_out
 from vecenv.simpler.published import PROTOCOLS, EpisodeSpec, PublishedError, episodes, num_episodes, scene_of
-from vecenv.simpler.tasks import BRIDGE, GOOGLE, TASKS, UnknownTask, eval_metadata
+from vecenv.simpler.tasks import BRIDGE, DATA, GOOGLE, TASKS, UnknownTask, eval_metadata
 
 if TYPE_CHECKING:
     from vecenv.simpler.env import SimplerEnv
@@ -249,6 +251,37 @@ def test_ten_resets_in_a_row_are_the_list_of_what_is_not_swept() -> None:
     assert [start["index"] for start in started(MATCHING, OBJECT)] == list(range(10))
     assert {len(start["objects"]) for start in started(MATCHING, OBJECT)} == {1}
     assert len({next(iter(start["objects"])) for start in started(MATCHING, OBJECT)}) > 4
+
+
+# -- files -----------------------------------------------------------------
+
+
+def test_whatever_only_variant_aggregation_opens_can_be_pulled() -> None:
+    wanted = {stage for task, counts in COUNTS.items() if counts[1] for stage in stages(AGGREGATION, task)}
+    usual = read_manifest().by_path
+    assert wanted - set(usual) == {
+        path for path in read_manifest(VARIANTS_MANIFEST).by_path if path.parent.name == "stages"
+    }
+    assert stages(MATCHING, COKE) | stages(MATCHING, CARROT) <= set(usual)
+    for spec in episodes(AGGREGATION, OPEN):
+        assert DATA / f"custom/{spec.station}.urdf" in usual
+    assert how_to_get(DATA / "custom/models/stone_tabletop.glb") == "vecenv assets pull simpler-variants"
+
+
+def stages(protocol: str, task: str) -> set[PurePosixPath]:
+    meshes = (scene_of(spec)[0].stage.mesh for spec in episodes(protocol, task))
+    return {mesh for mesh in meshes if mesh is not None}
+
+
+def test_the_command_pulls_variants_alone(tmp_path: Path) -> None:
+    stone = "data/custom/models/stone_tabletop.glb"
+    (tmp_path / "from" / stone).parent.mkdir(parents=True)
+    (tmp_path / "from" / stone).write_bytes(b"not the stone")
+    command = ["pull", "simpler-variants", "--from", str(tmp_path / "from"), "--to", str(tmp_path / "to")]
+    done = CliRunner().invoke(assets_app, command)
+    assert done.exit_code == 1
+    assert "0 files fetched, 0 were there, 8 missing" in done.output
+    assert f"missing: {stone}" in done.output
 
 
 # -- environments ----------------------------------------------------------

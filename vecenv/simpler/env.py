@@ -84,7 +84,8 @@ class SimplerConfig:
         servo: speeds and tolerances of ``step_ee_pose``; None for the suite's own.
         overlay: what replaces the background of pictures: ``"background"``, a photograph, as upstream's visual matching
             does; ``"none"``; or ``"blend"``, both at one half.
-        shadows: whether lights cast shadows; upstream's do not.
+        shadows: whether lights cast shadows; upstream's do not, except at variant aggregation's cabinets, where they do
+            here too.
         variant: what is different from visual matching's scenes; None for nothing.
         protocol: which episodes there are, one of ``published.PROTOCOLS``: ``"seed"``, 50 of every task, or one of
             upstream's lists, which decide robots, scenes, pictures and budgets.

@@ -30,7 +30,7 @@ from vecenv.simpler.scenes import (
     Start,
 )
 from vecenv.simpler.tasks import BRIDGE, DRAWERS, ModelInfo, SimplerTask, read_models
-from vecenv.simpler.variants import FROM_UPSTREAM, station_meshes
+from vecenv.simpler.variants import station_meshes
 from vecenv.simpler.weld import LinkSurface
 
 # The cabinet's place in the world.
@@ -192,7 +192,7 @@ def require_drawable(episode: Episode, root: Path) -> None:
         AssetsMissing: something is not; the message names the file.
     """
     if episode.undrawn:
-        raise AssetsMissing(assets.NAME, f"{root} has no {episode.undrawn[0]}", FROM_UPSTREAM)
+        raise AssetsMissing(assets.NAME, f"{root} has no {episode.undrawn[0]}", assets.HOW_TO_GET_VARIANTS)
 
 
 def _three(values: tuple[float, ...]) -> tuple[float, float, float]:

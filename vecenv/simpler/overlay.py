@@ -139,7 +139,8 @@ class Style:
     Attributes:
         overlay: ``"background"``, upstream's visual matching; ``"none"``, the drawn scene; or ``"blend"``, both at one
             half, to see how well they match.
-        shadows: lights that can cast shadows do; upstream leaves them off.
+        shadows: lights that can cast shadows do; else only those that do upstream, the ones around cabinets of variant
+            aggregation.
     """
 
     overlay: str = "background"
@@ -237,6 +238,7 @@ class _Twin:
 
     def __init__(self, subject: Subject, shadows: bool) -> None:
         check_renderer()
+        shadows = shadows or subject.lighting.casts
         self._scene = Scene(subject.spec, visuals=True)
         self._names = instances(subject.spec)
         _light(self._scene.sapien, subject.lighting, shadows)

@@ -93,10 +93,11 @@ class DirectionalLight:
 
 @dataclass(frozen=True, kw_only=True)
 class Lighting:
-    """Light of a scene: ``ambient`` colour and the directional lights."""
+    """Light of a scene: ``ambient`` colour and the directional lights; ``casts``: they cast shadows upstream."""
 
     ambient: tuple[float, float, float]
     directional: tuple[DirectionalLight, ...] = ()
+    casts: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

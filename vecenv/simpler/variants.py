@@ -19,14 +19,13 @@ from typing import Any
 import numpy as np
 
 from vecenv.assets import AssetsMissing
-from vecenv.simpler.assets import NAME
+from vecenv.simpler.assets import NAME, how_to_get
 from vecenv.simpler.layouts import Layout, Placed
 from vecenv.simpler.tasks import DATA, DirectionalLight, Lighting, SimplerTask, Stage
 
 _ON_TABLE, _AT_CABINET = ("pick", "move_near"), ("open", "close", "place")
 _GOOGLE_FAMILIES = (*_ON_TABLE, *_AT_CABINET)
 _COKE = "opened_coke_can"
-FROM_UPSTREAM = "copy it from ManiSkill2_real2sim's repository; `vecenv assets pull` knows what visual matching needs"
 _AMBIENT = (0.3, 0.3, 0.3)
 
 
@@ -40,7 +39,7 @@ def _sun(x: float, y: float, z: float, brightness: float, shadow: bool = False) 
 
 def _room(brightness: float) -> Lighting:
     sides = (_sun(-1, 1, -0.05, 0.5), _sun(-1, -1, -0.05, 0.5))
-    return Lighting(ambient=_AMBIENT, directional=(_sun(-0.2, 0, -1, brightness, shadow=True), *sides))
+    return Lighting(ambient=_AMBIENT, directional=(_sun(-0.2, 0, -1, brightness, shadow=True), *sides), casts=True)
 
 
 TABLE_LIGHTS: Mapping[str, Lighting] = MappingProxyType(
@@ -56,7 +55,8 @@ TABLE_LIGHTS: Mapping[str, Lighting] = MappingProxyType(
 CABINET_LIGHTS: Mapping[str, Lighting] = MappingProxyType(
     {"room": _room(1.0), "brighter": _room(2.0), "darker": _room(0.5)}
 )
-"""Light of ``open``, ``close`` and ``place``; ``room`` is variant aggregation's own, the others vary that."""
+"""Light of ``open``, ``close`` and ``place``; ``room`` is variant aggregation's own, the others vary that. It casts
+shadows, as upstream's does."""
 STATIONS = ("mk_station", "mk_station2", "mk_station3", "mk_station4")
 """Cabinets beside visual matching's ``mk_station_recolor``."""
 STAGES = (
@@ -65,7 +65,7 @@ STAGES = (
     "google_pick_coke_can_1_v4_alt_background",
     "google_pick_coke_can_1_v4_alt_background_2",
 )
-"""Tables and rooms of ``pick`` and ``move_near``; their files are not among those that ``assets pull`` knows."""
+"""Tables and rooms of ``pick`` and ``move_near``; ``vecenv assets pull simpler-variants`` fetches their files."""
 CAMERAS: Mapping[str, float] = MappingProxyType({"lower": 0.9351361, "higher": 0.6651361})
 """Tilt of the head, radians; 0.7851361 otherwise."""
 DISTRACTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -141,7 +141,7 @@ def station_meshes(station: PurePosixPath, root: Path) -> tuple[PurePosixPath, .
         AssetsMissing: there is no such cabinet; the message names the file.
     """
     if not (root / station).is_file():
-        raise AssetsMissing(NAME, f"{root} has no {station}", FROM_UPSTREAM)
+        raise AssetsMissing(NAME, f"{root} has no {station}", how_to_get(station))
     names = (mesh.attrib["filename"] for mesh in ET.parse(root / station).iter("mesh"))
     return tuple(station.parent / name for name in dict.fromkeys(names))
 
