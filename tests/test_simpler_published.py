@@ -347,7 +347,7 @@ def test_episodes_are_chosen_from_the_list_and_no_further(small: Path) -> None:
     with pytest.raises(PlacementError, match="episode 24 does not exist; there are 24"):
         env.set_episodes(episodes=24)
     env.close()
-    with pytest.raises(PlacementError, match=f"episode 10 of {OBJECT} does not exist under .*there are 10"):
+    with pytest.raises(PlacementError, match="episode 10 does not exist; there are 10"):
         vecenv.make(GOOGLE, tasks=[COKE, OBJECT], protocol=MATCHING, episodes=[10], assets=small)
     with pytest.raises(PublishedError, match=f"no episodes of {OBJECT}"):
         vecenv.make(GOOGLE, task=OBJECT, protocol=AGGREGATION, episodes=[0], assets=small)

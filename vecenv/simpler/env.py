@@ -34,7 +34,7 @@ from vecenv.simpler import assets, kinematics, robots
 from vecenv.simpler.episodes import Episode, prepare, require_drawable
 from vecenv.simpler.judge import Judge, Verdict
 from vecenv.simpler.kinematics import rotation_from_quat
-from vecenv.simpler.published import SEED, EpisodeSpec, check_placement, check_protocol, counts, scene_of
+from vecenv.simpler.published import SEED, EpisodeSpec, check_placement, check_protocol, counts, place, scene_of
 from vecenv.simpler.published import episodes as published_episodes
 from vecenv.simpler.scenes import instances
 from vecenv.simpler.servo import Servo, ServoConfig
@@ -552,18 +552,10 @@ def make(suite: str, *, task: Any = None, tasks: Any = None, episodes: Any = Non
         UnknownSuite, UnknownTask, PlacementError, PublishedError, SimplerError, AssetsMissing: something that does not
             exist.
     """
-    protocol = options.get("protocol", SEED)
-    there = counts(protocol, suite)
     if task is not None and tasks is not None:
         raise SimplerError("give task or tasks, not both")
     chosen = task_indices(suite, tasks if task is None else task)
-    placement = placing.cross(
-        list(there) if chosen is None else chosen,
-        {index: range(count) for index, count in there.items()} if episodes is None else episodes,
-        num_tasks=len(list_tasks(suite)),
-        num_episodes=max(there.values()),
-    )
-    check_placement(protocol, suite, placement)
+    placement = place(options.get("protocol", SEED), suite, chosen, episodes)
     tree = options.pop("assets", None)
     chosen_variant = make_variant(options.pop("variant", None))
     config = SimplerConfig(assets=Path(tree) if tree else None, variant=chosen_variant, **options)

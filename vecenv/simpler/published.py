@@ -33,12 +33,14 @@ from __future__ import annotations
 
 import difflib
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Sized
 from dataclasses import fields, replace
 from types import MappingProxyType
 from typing import Any
 
-from vecenv.placement import Placement, PlacementError
+import numpy as np
+
+from vecenv.placement import Placement, PlacementError, cross
 from vecenv.simpler.layouts import Choices, Layout, drawn, episode_seed, lay_out, unseeded_seeds
 from vecenv.simpler.specs import (
     PROTOCOLS,
@@ -76,6 +78,7 @@ __all__ = [
     "counts",
     "episodes",
     "num_episodes",
+    "place",
     "scene_of",
 ]
 
@@ -95,6 +98,10 @@ def episodes(protocol: str, task: str) -> Sequence[EpisodeSpec]:
         PublishedError: no such protocol, or upstream has no episodes of this task under it.
         UnknownTask: no such task.
     """
+    return _checked(protocol, task)
+
+
+def _checked(protocol: str, task: str) -> tuple[EpisodeSpec, ...]:
     rows = _rows(check_protocol(protocol), _task(task).name)
     if not rows:
         there = ", ".join(name for name in TASKS if _rows(protocol, name))
@@ -128,21 +135,38 @@ def counts(protocol: str, suite: str) -> dict[int, int]:
     return {index: count for index, count in found.items() if count}
 
 
-def check_placement(protocol: str, suite: str, placement: Placement) -> Placement:
-    """A placement whose episodes all exist.
+def place(protocol: str, suite: str, tasks: Any, episodes: Any) -> Placement:
+    """Every chosen episode of every chosen task, task by task.
+
+    Args:
+        protocol: one of ``PROTOCOLS``.
+        suite: the suite.
+        tasks: one index or several; None for every task that the protocol has episodes of.
+        episodes: as for ``placement.cross``; None for all that the protocol has of a task.
 
     Raises:
         PublishedError: a task that the protocol has no episodes of.
-        PlacementError: an episode beyond the last of its task; the message says how many there are.
+        PlacementError: a task or an episode that does not exist, or nothing to place.
     """
-    names = [task.name for task in list_tasks(suite)]
-    for index, episode in zip(placement.task.tolist(), placement.episode.tolist(), strict=True):
-        count = len(episodes(protocol, names[index]))
-        if episode >= count:
-            raise PlacementError(
-                f"episode {episode} of {names[index]} does not exist under protocol {protocol!r}; "
-                f"there are {count} (0 to {count - 1})"
-            )
+    there, names = counts(protocol, suite), [task.name for task in list_tasks(suite)]
+    chosen = cross(list(there) if tasks is None else tasks, [0], num_tasks=len(names), num_episodes=1).task.tolist()
+    parts = []
+    for task in chosen:
+        count = len(_checked(protocol, names[task]))
+        wanted = episodes.get(task, ()) if isinstance(episodes, Mapping) else episodes
+        if wanted is None or not isinstance(wanted, Sized) or len(wanted):
+            every = range(count) if wanted is None else wanted
+            parts.append(cross([task], every, num_tasks=len(names), num_episodes=count))
+    if not parts:
+        raise PlacementError("no slot to fill: tasks or episodes are empty")
+    columns = [np.concatenate([getattr(part, column) for part in parts]) for column in ("task", "episode")]
+    return Placement(*columns)
+
+
+def check_placement(protocol: str, suite: str, placement: Placement) -> Placement:
+    """A placement whose episodes all exist; errors as of ``place``."""
+    for task, episode in zip(placement.task.tolist(), placement.episode.tolist(), strict=True):
+        place(protocol, suite, task, [episode])
     return placement
 
 
