@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import os
 import subprocess
@@ -21,8 +22,8 @@ from pathlib import Path, PurePosixPath
 
 from vecenv.simpler import assets
 from vecenv.simpler.published import ROOMS
-from vecenv.simpler.tasks import COKE_TABLE, DATA, TASKS, Stage
-from vecenv.simpler.variants import STAGES
+from vecenv.simpler.tasks import COKE_TABLE, DATA, PLAIN_TRIPLETS, TASKS, Stage, model_folder
+from vecenv.simpler.variants import DISTRACTORS, STAGES
 
 COMMIT = "ef7a4d4fdf4b69f2c2154db5b15b9ac8dfe10682"
 # Objects that move_near and pick draw from a mesh in a file of this name; the others' are in the tree.
@@ -46,8 +47,9 @@ def main() -> None:
     parser.add_argument("--variants", type=Path, default=assets.VARIANTS_MANIFEST)
     options = parser.parse_args()
     blobs = git_blobs(options.git, options.commit)
-    varied: dict[str, str | None] = dict.fromkeys(variant_files())
-    tasks = {**needed(blobs), **dict.fromkeys(path for path in files(options.tree) if path not in varied)}
+    there = files(options.tree)
+    varied: dict[str, str | None] = dict.fromkeys(variant_files(blobs, there))
+    tasks = {**needed(blobs), **dict.fromkeys(path for path in there if path not in varied)}
     for out, wanted in ((options.out, tasks), (options.variants, varied)):
         write(out, options.commit, [row(options, path, blobs, wanted[path]) for path in sorted(wanted)])
 
@@ -60,10 +62,14 @@ def write(out: Path, commit: str, rows: list[dict[str, str | int]]) -> None:
     print(f"{len(rows)} files, {len(absent)} of them only with Git's identifier:", *absent, sep="\n  ")
 
 
-def variant_files() -> list[str]:
-    """Tables and rooms of variant aggregation, and the mesh of one of its cabinets."""
+def variant_files(blobs: dict[str, str], tree: list[str]) -> list[str]:
+    """Tables and rooms of variant aggregation, the mesh of one of its cabinets, and what its objects are drawn with."""
     tables = [Stage(name=name, offset=COKE_TABLE.offset) for name in STAGES]
-    return [*(str(stage.mesh) for stage in (*tables, *ROOMS.values())), f"{DATA}/custom/models/stone_tabletop.glb"]
+    meshes = [str(stage.mesh) for stage in (*tables, *ROOMS.values())]
+    models = {*itertools.chain(*PLAIN_TRIPLETS, *DISTRACTORS.values())} - set(_MISSING_VISUALS)
+    folders = tuple(f"{model_folder(model)}/" for model in models)
+    drawn = [path for path in blobs if path.startswith(folders) and path.endswith((".dae", ".png", ".jpg"))]
+    return [*meshes, f"{DATA}/custom/models/stone_tabletop.glb", *(path for path in drawn if path not in tree)]
 
 
 def files(tree: Path) -> list[str]:
