@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+import simpler_assets_small
 from typer.testing import CliRunner
 
 import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.placement import PlacementError
+from vecenv.simpler import published
 from vecenv.simpler.assets import VARIANTS_MANIFEST, assets_app, how_to_get, read_manifest
 from vecenv.simpler.layouts import LayoutError, episode_layout, episode_seed, lay_out
 from vecenv.simpler.published import PROTOCOLS, EpisodeSpec, PublishedError, episodes, num_episodes, scene_of
@@ -423,3 +425,34 @@ def test_pictures_of_variant_aggregation_show_the_drawn_scene_and_its_light(smal
     assert darker < usual < brighter
     assert (seen[MATCHING][0] == (90, 120, 150)).all(), "the generated photograph has one colour"
     assert not (seen[AGGREGATION][1] == (90, 120, 150)).all()
+
+
+@pytest.mark.heavy
+def test_a_room_is_seen_around_its_cabinet_and_not_touched(tmp_path: Path) -> None:
+    pytest.importorskip("sapien")
+    import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    from vecenv.simpler import overlay
+
+    try:
+        overlay.check_renderer()
+    except overlay.RendererMissing:
+        pytest.skip("no Vulkan driver")
+    root = simpler_assets_small.build(tmp_path)
+    # A green slab that fills the place of robot and cabinet: nothing could move if it had collision shapes.
+    slab = trimesh.creation.box((20.0, 2.0, 20.0))
+    slab.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[0, 200, 0, 255]))
+    mesh = published.ROOMS["frl_apartment_stage_simple"].mesh
+    assert mesh is not None
+    (root / mesh).parent.mkdir(parents=True)
+    slab.export(root / mesh)
+    env = batch(root, AGGREGATION, "google_robot_close_top_drawer", [4])
+    before = env.state().qpos
+    seen = env.observe_egocentric()
+    red, green, _ = (float(seen.rgb[0][seen.segmentation[0] == 0][:, channel].mean()) for channel in range(3))
+    assert green > red + 30
+    env.step_continuous(np.zeros((1, 7)))
+    np.testing.assert_allclose(env.state().qpos[0, 11:14], before[0, 11:14], atol=1e-3)
+    env.close()
