@@ -18,13 +18,12 @@ import pytest
 import simpler_assets_small
 from typer.testing import CliRunner
 
-import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.placement import PlacementError
 from vecenv.simpler import published
 from vecenv.simpler.assets import VARIANTS_MANIFEST, assets_app, how_to_get, read_manifest
 from vecenv.simpler.layouts import LayoutError, episode_layout, episode_seed, lay_out
-from vecenv.simpler.published import PROTOCOLS, EpisodeSpec, PublishedError, episodes, num_episodes, scene_of
+from vecenv.simpler.published import PROTOCOLS, EpisodeSpec, PublishedError, episodes, num_episodes, place, scene_of
 from vecenv.simpler.tasks import BRIDGE, DATA, GOOGLE, TASKS, UnknownTask, eval_metadata, model_folder
 
 if TYPE_CHECKING:
@@ -294,11 +293,17 @@ def test_the_command_pulls_variants_alone(tmp_path: Path) -> None:
 # -- environments ----------------------------------------------------------
 
 
-def batch(root: Path, protocol: str, task: str, rows: Sequence[int]) -> SimplerEnv:
+def made(root: Path, protocol: str, task: Any, rows: Any, **options: Any) -> SimplerEnv:
     pytest.importorskip("sapien")
     from vecenv.simpler.env import make
 
-    env = make(TASKS[task].suite, task=task, protocol=protocol, episodes=rows, assets=root, num_workers=1)
+    tasks = [task] if isinstance(task, str) else task
+    suite = TASKS[tasks[0]].suite
+    return make(suite, tasks=tasks, protocol=protocol, episodes=rows, assets=root, num_workers=1, **options)
+
+
+def batch(root: Path, protocol: str, task: str, rows: Sequence[int]) -> SimplerEnv:
+    env = made(root, protocol, task, rows)
     env.reset()
     return env
 
@@ -348,29 +353,38 @@ def test_a_batch_mixes_settings_and_repeats_each_as_if_it_were_alone(small: Path
 
 
 def test_episodes_are_chosen_from_the_list_and_no_further(small: Path) -> None:
-    pytest.importorskip("sapien")
-    env = vecenv.make(BRIDGE, task=CARROT, protocol=MATCHING, assets=small, num_threads=1)
+    env = made(small, MATCHING, CARROT, None)
     assert env.reset().episode_id == tuple(f"{BRIDGE}/{CARROT}/{episode}" for episode in range(24))
     with pytest.raises(PlacementError, match="episode 24 does not exist; there are 24"):
         env.set_episodes(episodes=24)
     env.close()
     with pytest.raises(PlacementError, match="episode 10 does not exist; there are 10"):
-        vecenv.make(GOOGLE, tasks=[COKE, OBJECT], protocol=MATCHING, episodes=[10], assets=small)
+        made(small, MATCHING, [COKE, OBJECT], [10])
     with pytest.raises(PublishedError, match=f"no episodes of {OBJECT}"):
-        vecenv.make(GOOGLE, task=OBJECT, protocol=AGGREGATION, episodes=[0], assets=small)
+        made(small, AGGREGATION, OBJECT, [0])
     with pytest.raises(PublishedError, match="available: visual-matching, variant-aggregation, seed"):
-        vecenv.make(GOOGLE, task=COKE, protocol="published", episodes=[0], assets=small)
+        made(small, "published", COKE, [0])
     with pytest.raises(ValueError, match="protocol 'visual-matching' says itself what varies"):
-        vecenv.make(GOOGLE, task=COKE, protocol=MATCHING, variant={"camera": "lower"}, episodes=[0], assets=small)
+        made(small, MATCHING, COKE, [0], variant={"camera": "lower"})
+
+
+def test_tasks_of_a_batch_have_as_many_episodes_as_their_lists(small: Path) -> None:
+    env = made(small, MATCHING, [CARROT, "widowx_stack_cube"], {1: [3], 2: range(2)})
+    assert env.placement.task.tolist() == [1, 2, 2]
+    assert env.placement.episode.tolist() == [3, 0, 1]
+    env.close()
+    placement = place(MATCHING, GOOGLE, None, None)
+    assert len(placement) == sum(counts[0] for task, counts in COUNTS.items() if not task.startswith("widowx"))
+    with pytest.raises(PlacementError, match="no slot to fill"):
+        place(MATCHING, GOOGLE, [0, 1], {5: [0]})
 
 
 def test_a_table_that_is_not_there_is_named(small: Path) -> None:
-    pytest.importorskip("sapien")
     named = {}
     for spec in episodes(AGGREGATION, COKE):
         if spec.setting in ("table", "background") and spec.scene not in named:
             with pytest.raises(AssetsMissing, match=rf"stages/{spec.scene}\.glb"):
-                vecenv.make(GOOGLE, task=COKE, protocol=AGGREGATION, episodes=[spec.index], assets=small)
+                made(small, AGGREGATION, COKE, [spec.index])
             named[spec.scene] = spec.index
     assert len(named) == 4
 

@@ -58,7 +58,6 @@ def make(
     overlay: str = "background",
     shadows: bool = False,
     variant: Variant | Mapping[str, Any] | None = None,
-    protocol: str = "seed",
     assets: str | Path | None = None,
 ) -> BatchEnv:
     """A batch of episodes: every one of ``episodes`` of every one of ``tasks``, task by task, one a slot.
@@ -97,8 +96,6 @@ def make(
         shadows: SIMPLER. Whether lights cast shadows; upstream's do not.
         variant: SIMPLER. What differs from visual matching's scenes (light, camera, cabinet, table, distractors): a
             ``vecenv.simpler.variants.Variant`` or a mapping of its fields.
-        protocol: SIMPLER. Which list of episodes: ``"seed"``, 50 of every task; or upstream's own,
-            ``"visual-matching"`` or ``"variant-aggregation"`` (``vecenv.simpler.published``).
         assets: SIMPLER. Root of the asset tree; None for where ``vecenv assets pull simpler`` puts it
             (``VECENV_SIMPLER_ASSETS`` names another).
 
@@ -127,7 +124,6 @@ def make(
         "overlay": (overlay, "background"),
         "shadows": (shadows, False),
         "variant": (variant, None),
-        "protocol": (protocol, "seed"),
         "assets": (assets, None),
     }
     if family(suite) == _SIMPLER:
