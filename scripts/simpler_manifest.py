@@ -1,4 +1,5 @@
-"""Write ``vecenv/simpler/manifest.json``: the files that SIMPLER's tasks open, with their sizes and hashes.
+"""Write ``vecenv/simpler/manifest.json``: the files that SIMPLER's tasks open, with their sizes and hashes; and
+``manifest_variants.json``, those that only variant aggregation opens.
 
 In: an asset tree in the layout of ManiSkill2_real2sim, and a clone of that repository. Every file of the tree is
 listed, and must have the content that the repository's commit has at that path. What the tasks open but the tree lacks
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import os
 import subprocess
@@ -19,7 +21,9 @@ import sys
 from pathlib import Path, PurePosixPath
 
 from vecenv.simpler import assets
-from vecenv.simpler.tasks import TASKS
+from vecenv.simpler.published import ROOMS
+from vecenv.simpler.tasks import COKE_TABLE, DATA, PLAIN_TRIPLETS, TASKS, Stage, model_folder
+from vecenv.simpler.variants import DISTRACTORS, STAGES
 
 COMMIT = "ef7a4d4fdf4b69f2c2154db5b15b9ac8dfe10682"
 # Objects that move_near and pick draw from a mesh in a file of this name; the others' are in the tree.
@@ -40,14 +44,32 @@ def main() -> None:
     parser.add_argument("--git", type=Path, required=True, help="clone of ManiSkill2_real2sim")
     parser.add_argument("--commit", default=COMMIT)
     parser.add_argument("--out", type=Path, default=assets.MANIFEST)
+    parser.add_argument("--variants", type=Path, default=assets.VARIANTS_MANIFEST)
     options = parser.parse_args()
     blobs = git_blobs(options.git, options.commit)
-    wanted: dict[str, str | None] = {**needed(blobs), **dict.fromkeys(files(options.tree))}
-    rows = [row(options, path, blobs, wanted[path]) for path in sorted(wanted)]
+    there = files(options.tree)
+    varied: dict[str, str | None] = dict.fromkeys(variant_files(blobs, there))
+    tasks = {**needed(blobs), **dict.fromkeys(path for path in there if path not in varied)}
+    for out, wanted in ((options.out, tasks), (options.variants, varied)):
+        write(out, options.commit, [row(options, path, blobs, wanted[path]) for path in sorted(wanted)])
+
+
+def write(out: Path, commit: str, rows: list[dict[str, str | int]]) -> None:
+    """A manifest, and a word about it."""
     lines = ",\n  ".join(json.dumps(entry) for entry in rows)
-    options.out.write_text(f'{{"commit": "{options.commit}", "files": [\n  {lines}\n]}}\n')
+    out.write_text(f'{{"commit": "{commit}", "files": [\n  {lines}\n]}}\n')
     absent = [str(entry["path"]) for entry in rows if "sha256" not in entry]
     print(f"{len(rows)} files, {len(absent)} of them only with Git's identifier:", *absent, sep="\n  ")
+
+
+def variant_files(blobs: dict[str, str], tree: list[str]) -> list[str]:
+    """Tables and rooms of variant aggregation, the mesh of one of its cabinets, and what its objects are drawn with."""
+    tables = [Stage(name=name, offset=COKE_TABLE.offset) for name in STAGES]
+    meshes = [str(stage.mesh) for stage in (*tables, *ROOMS.values())]
+    models = {*itertools.chain(*PLAIN_TRIPLETS, *DISTRACTORS.values())} - set(_MISSING_VISUALS)
+    folders = tuple(f"{model_folder(model)}/" for model in models)
+    drawn = [path for path in blobs if path.startswith(folders) and path.endswith((".dae", ".png", ".jpg"))]
+    return [*meshes, f"{DATA}/custom/models/stone_tabletop.glb", *(path for path in drawn if path not in tree)]
 
 
 def files(tree: Path) -> list[str]:

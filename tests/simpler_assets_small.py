@@ -1,8 +1,8 @@
 """A small asset tree for SIMPLER, generated: robots of boxes with the real joints, boxes for objects, flat pictures.
 
-In: an empty folder. Out: the same folder in upstream's layout, with every file that the 25 tasks ask for except stages,
-for which the library has stand-ins. Lengths between joints are those of the real robots, so the same poses are within
-reach; everything else is as plain as it can be.
+In: an empty folder. Out: the same folder in upstream's layout, with every file that the 25 tasks and their variants ask
+for except stages; for visual matching's the library has stand-ins. Lengths between joints are those of the real robots,
+so the same poses are within reach; everything else is as plain as it can be.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from vecenv.simpler.robots import GOOGLE_ROBOT, WIDOWX
-from vecenv.simpler.tasks import TASKS
+from vecenv.simpler.tasks import DATA, PLAIN_MODELS_FILE, PLAIN_TRIPLETS, TASKS
 
 _Vector = tuple[float, float, float]
 # Half sizes of objects that must not be cubes, metres.
@@ -41,8 +41,8 @@ def build(root: Path) -> Path:
     for task in TASKS.values():
         for picture in task.overlays:
             _picture(root / picture, (task.camera.width, task.camera.height))
-        if task.station:
-            _write(root / task.station, _station())
+    for name in ("mk_station_recolor", "mk_station", "mk_station2", "mk_station3"):
+        _write(root / DATA / f"custom/{name}.urdf", _station())
     _objects(root)
     return root
 
@@ -68,6 +68,7 @@ def _objects(root: Path) -> None:
         if task.models_file:
             names = {*task.models, *itertools.chain.from_iterable(task.triplets)}
             models.setdefault(task.models_file, set()).update(names)
+    models[PLAIN_MODELS_FILE].update(itertools.chain.from_iterable(PLAIN_TRIPLETS))
     for file, names in models.items():
         _write(root / "data/custom" / file, json.dumps({name: _info(name) for name in sorted(names)}))
     for name in {*itertools.chain.from_iterable(models.values()), "sink"}:

@@ -61,7 +61,7 @@ def canonical(layout: Layout) -> dict[str, Any]:
         "objects": [[o.model, rounded(o.position), canonical_quat(o.quat)] for o in layout.objects],
         "base": [rounded(layout.base_position), canonical_quat(layout.base_quat)],
         "urdf": layout.urdf_version,
-        "overlay": layout.overlay.name,
+        "overlay": layout.overlay.name if layout.overlay else "",
         "drawer": layout.drawer,
         "instructions": [text for text in (layout.instruction, layout.second_instruction) if text],
         "orientation": layout.orientation,

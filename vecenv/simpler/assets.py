@@ -3,8 +3,9 @@
 In: the asset tree, in upstream's own layout (``data/...`` and ``mani_skill2_real2sim/...`` of ManiSkill2_real2sim):
 the folder that ``VECENV_SIMPLER_ASSETS`` names, else the user's data folder, which ``vecenv assets pull simpler``
 fills. Out: ``resolve`` and ``visual_mesh``, paths of files, or a ``StandIn`` where a file is missing that a plain shape
-can replace; whoever uses one has its ``note`` to pass on. ``manifest.json`` lists the files with their hashes; it is
-written by ``scripts/simpler_manifest.py``. Downloading is in ``pull.py``.
+can replace; whoever uses one has its ``note`` to pass on. ``manifest.json`` lists the files with their hashes,
+``manifest_variants.json`` those that only variant aggregation needs; both are written by
+``scripts/simpler_manifest.py``. Downloading is in ``pull.py``.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from vecenv.assets import AssetRow, AssetsMissing
 VARIABLE = "VECENV_SIMPLER_ASSETS"
 NAME = "SIMPLER meshes, pictures and robots"
 HOW_TO_GET = "vecenv assets pull simpler"
+HOW_TO_GET_VARIANTS = "vecenv assets pull simpler-variants"
 MANIFEST = Path(__file__).with_name("manifest.json")
+VARIANTS_MANIFEST = Path(__file__).with_name("manifest_variants.json")
 _MARKERS = ("data/custom", "mani_skill2_real2sim/assets/descriptions")
 _STAGES = PurePosixPath("data/hab2_bench_assets/stages")
 _MODELS = PurePosixPath("data/custom/models")
@@ -246,7 +249,12 @@ def resolve(name: str | PurePosixPath, root: Path | None = None) -> Resolved:
         return Resolved(stand_in=_table(path))
     if path.parent.parent == _MODELS and path.name in _VISUALS and (tree / path.parent / "collision.obj").is_file():
         return Resolved(stand_in=_bare_mesh(path, tree))
-    raise AssetsMissing(NAME, f"{tree} has no {path}", HOW_TO_GET)
+    raise AssetsMissing(NAME, f"{tree} has no {path}", how_to_get(path))
+
+
+def how_to_get(path: PurePosixPath) -> str:
+    """The command that fetches a file of the tree."""
+    return HOW_TO_GET_VARIANTS if path in read_manifest(VARIANTS_MANIFEST).by_path else HOW_TO_GET
 
 
 def collision_mesh(model: str, root: Path | None = None) -> Path:
@@ -308,7 +316,8 @@ def _listed_visual(model: str) -> str:
 # Command line.
 
 assets_app = typer.Typer(no_args_is_help=True)
-_SETS = ("simpler",)
+# What can be pulled -> its manifest; None for the one that ``pull`` takes by itself.
+_SETS = {"simpler": None, "simpler-variants": VARIANTS_MANIFEST}
 
 
 @assets_app.callback()
@@ -334,12 +343,14 @@ def pull_command(
         raise typer.Exit(1) from None
     if what not in _SETS:
         raise typer.BadParameter(f"{what!r}; known: {', '.join(_SETS)}", param_hint="WHAT")
+    listed = _SETS[what]
     try:
         with Progress(transient=True, disable=not sys.stderr.isatty()) as progress:
             bar = progress.add_task(what)
             report = pull.pull(
                 to or default_root(),
                 source,
+                manifest=read_manifest(listed) if listed else None,
                 notice=lambda done, total: progress.update(bar, completed=done, total=total),
             )
     except (pull.PullError, ManifestError) as error:

@@ -33,14 +33,15 @@ from vecenv.contract import (
 )
 from vecenv.controllers.waypoint import Plan
 from vecenv.simpler import assets, kinematics, robots
-from vecenv.simpler.episodes import Episode, prepare
+from vecenv.simpler.episodes import Episode, prepare, require_drawable
 from vecenv.simpler.judge import Judge, Verdict
 from vecenv.simpler.kinematics import rotation_from_quat
-from vecenv.simpler.layouts import episode_layout, episode_seed
+from vecenv.simpler.published import SEED, EpisodeSpec, check_placement, check_protocol, counts, place, scene_of
+from vecenv.simpler.published import episodes as published_episodes
 from vecenv.simpler.scenes import instances
 from vecenv.simpler.servo import Servo, ServoConfig
-from vecenv.simpler.tasks import NUM_EPISODES, SimplerTask, find_task, list_tasks
-from vecenv.simpler.variants import Variant, make_variant, require_files, varied
+from vecenv.simpler.tasks import find_task, list_tasks
+from vecenv.simpler.variants import Variant, make_variant, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
@@ -87,8 +88,11 @@ class SimplerConfig:
         servo: speeds and tolerances of ``step_ee_pose``; None for the suite's own.
         overlay: what replaces the background of pictures: ``"background"``, a photograph, as upstream's visual matching
             does; ``"none"``; or ``"blend"``, both at one half.
-        shadows: whether lights cast shadows; upstream's do not.
+        shadows: whether lights cast shadows; upstream's do not, except at variant aggregation's cabinets, where they do
+            here too.
         variant: what is different from visual matching's scenes; None for nothing.
+        protocol: which episodes there are, one of ``published.PROTOCOLS``: ``"seed"``, 50 of every task, or one of
+            upstream's lists, which decide robots, scenes, pictures and budgets.
         assets: root of the asset tree; None for where ``vecenv assets pull simpler`` puts it.
     """
 
@@ -101,6 +105,7 @@ class SimplerConfig:
     overlay: str = "background"
     shadows: bool = False
     variant: Variant | None = None
+    protocol: str = SEED
     assets: Path | None = None
 
     def __post_init__(self) -> None:
@@ -116,6 +121,8 @@ class SimplerConfig:
         ):
             if getattr(self, name) not in allowed:
                 raise SimplerError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
+        if check_protocol(self.protocol) != SEED and self.variant is not None:
+            raise SimplerError(f"variant={self.variant}: protocol {self.protocol!r} says itself what varies")
         for name in ("num_workers", "max_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -164,8 +171,10 @@ class SimplerEnv(SlotBatch):
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
     def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
-        counts = {"num_tasks": len(self.tasks), "num_episodes": NUM_EPISODES}
-        return placing.each(task_indices(self.suite, tasks), episodes, self._placement, **counts)
+        most = max(counts(self.config.protocol, self.suite).values())
+        limits = {"num_tasks": len(self.tasks), "num_episodes": most}
+        placement = placing.each(task_indices(self.suite, tasks), episodes, self._placement, **limits)
+        return check_placement(self.config.protocol, self.suite, placement)
 
     def _prepare(self) -> np.ndarray:
         """Episodes and verdicts for the current placement."""
@@ -175,14 +184,22 @@ class SimplerEnv(SlotBatch):
         return np.array([self.config.max_steps or each.task.max_steps for each in self._episodes])
 
     def _episode(self, task: int, episode: int) -> Episode:
-        key, chosen = (task, episode), self.tasks[task]
+        key = (task, episode)
         if key not in self._prepared:
-            layout = episode_layout(chosen, episode_seed(episode))
-            chosen, layout = varied(chosen, layout, self.config.variant)
+            chosen, layout = varied(*scene_of(self._spec(*key)), self.config.variant)
+            made = prepare(chosen, layout, self._root)
             if self.config.variant is not None:
-                require_files(chosen, self._root)
-            self._prepared[key] = prepare(chosen, layout, self._root)
+                require_drawable(made, self._root)
+            self._prepared[key] = made
         return self._prepared[key]
+
+    def _spec(self, task: int, episode: int) -> EpisodeSpec:
+        return published_episodes(self.config.protocol, self.tasks[task].name)[episode]
+
+    @property
+    def specs(self) -> tuple[EpisodeSpec, ...]:
+        """For each slot, what its list says of the episode; ``config.variant`` comes on top."""
+        return tuple(self._spec(*self._key(slot)) for slot in range(self.num_envs))
 
     def _instruction(self, slot: int) -> str:
         layout, judge = self._episodes[slot].layout, self._judges[slot]
@@ -542,18 +559,13 @@ def make(suite: str, *, task: Any = None, tasks: Any = None, episodes: Any = Non
     """A batch of SIMPLER episodes; ``vecenv.make`` documents the arguments.
 
     Raises:
-        UnknownSuite, UnknownTask, PlacementError, SimplerError, AssetsMissing: something that does not exist.
+        UnknownSuite, UnknownTask, PlacementError, PublishedError, SimplerError, AssetsMissing: something that does not
+            exist.
     """
-    known: tuple[SimplerTask, ...] = list_tasks(suite)
     if task is not None and tasks is not None:
         raise SimplerError("give task or tasks, not both")
     chosen = task_indices(suite, tasks if task is None else task)
-    placement = placing.cross(
-        range(len(known)) if chosen is None else chosen,
-        range(NUM_EPISODES) if episodes is None else episodes,
-        num_tasks=len(known),
-        num_episodes=NUM_EPISODES,
-    )
+    placement = place(options.get("protocol", SEED), suite, chosen, episodes)
     tree = options.pop("assets", None)
     chosen_variant = make_variant(options.pop("variant", None))
     config = SimplerConfig(assets=Path(tree) if tree else None, variant=chosen_variant, **options)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vecenv.assets import AssetsMissing
 from vecenv.simpler import assets
 from vecenv.simpler.judge import Roles
 from vecenv.simpler.layouts import Layout, Placed
@@ -29,6 +30,7 @@ from vecenv.simpler.scenes import (
     Start,
 )
 from vecenv.simpler.tasks import BRIDGE, DRAWERS, ModelInfo, SimplerTask, read_models
+from vecenv.simpler.variants import station_meshes
 from vecenv.simpler.weld import LinkSurface
 
 # The cabinet's place in the world.
@@ -51,6 +53,7 @@ class Episode:
         task: its task. layout: where everything is.
         spec: the scene. start: where it begins. roles: who is who.
         notes: what is missing and what stands in for it.
+        undrawn: missing files that physics does without but pictures need: path in the asset tree, and what it is.
     """
 
     task: SimplerTask
@@ -59,6 +62,7 @@ class Episode:
     start: Start
     roles: Roles
     notes: tuple[str, ...]
+    undrawn: tuple[str, ...] = ()
 
 
 def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
@@ -85,7 +89,13 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
     )
     roles = _roles(layout, models)
     return Episode(
-        task=task, layout=layout, spec=spec, start=_start(layout, roles), roles=roles, notes=tuple(dict.fromkeys(notes))
+        task=task,
+        layout=layout,
+        spec=spec,
+        start=_start(layout, roles),
+        roles=roles,
+        notes=tuple(dict.fromkeys(notes)),
+        undrawn=_undrawn(task, root),
     )
 
 
@@ -143,17 +153,46 @@ def _body(placed: Placed, models: dict[str, ModelInfo], root: Path, notes: list[
 
 
 def _stage(task: SimplerTask, root: Path, notes: list[str]) -> Stage | None:
-    if task.stage.mesh is None:
+    """The surroundings that things can touch."""
+    if task.stage.mesh is None or not task.stage.solid:
         return None
     found = assets.resolve(task.stage.mesh, root)
     if found.path is not None:
-        return Stage(mesh=found.path, offset=task.stage.offset)
+        return Stage(mesh=found.path, mesh_pose=task.stage.turn, offset=task.stage.offset)
     assert found.stand_in is not None  # ``resolve`` gives one or the other
     notes.append(found.note)
     low, high = _TABLETOPS.get(task.suite, _COKE_TABLETOP)
     centre = (*((a + b) / 2 for a, b in zip(low, high, strict=True)), found.stand_in.top - _THICKNESS / 2)
     half = (*((b - a) / 2 for a, b in zip(low, high, strict=True)), _THICKNESS / 2)
     return Stage(boxes=(Box(centre=_three(centre), half_size=_three(half)),))
+
+
+def drawn_stage(episode: Episode, root: Path) -> Stage | None:
+    """The surroundings as they are drawn: rooms around cabinets can be seen but not touched."""
+    stage = episode.task.stage
+    if stage.solid or stage.mesh is None:
+        return episode.spec.stage
+    return Stage(mesh=root / stage.mesh, mesh_pose=stage.turn, offset=stage.offset, solid=False)
+
+
+def _undrawn(task: SimplerTask, root: Path) -> tuple[str, ...]:
+    """A room's mesh and those of a cabinet's links, where the tree lacks them."""
+    wanted = {}
+    if task.station is not None:
+        wanted = dict.fromkeys(station_meshes(task.station, root), f"a part of {task.station.name}")
+    if task.stage.mesh is not None and not task.stage.solid:
+        wanted[task.stage.mesh] = "the room around the cabinet"
+    return tuple(f"{path}, {what}" for path, what in wanted.items() if not (root / path).is_file())
+
+
+def require_drawable(episode: Episode, root: Path) -> None:
+    """Whether everything is there that pictures of an episode need.
+
+    Raises:
+        AssetsMissing: something is not; the message names the file.
+    """
+    if episode.undrawn:
+        raise AssetsMissing(assets.NAME, f"{root} has no {episode.undrawn[0]}", assets.HOW_TO_GET_VARIANTS)
 
 
 def _three(values: tuple[float, ...]) -> tuple[float, float, float]:

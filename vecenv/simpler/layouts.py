@@ -1,24 +1,26 @@
 """What an episode of SIMPLER consists of: which objects, where they are dropped, where the robot stands, what is said.
 
-In: a task and a seed. Out: a ``Layout``, decided by NumPy's ``RandomState`` alone, draw for draw as upstream does it
-(ManiSkill2_real2sim commit ef7a4d4, ``envs/custom_scenes``). Each class of upstream's hierarchy starts the episode's
-stream anew, so draws of different layers are made from equal streams: that is why several functions begin with a fresh
-``RandomState(seed)``. Objects are given where they are dropped, half a metre above the table; where they end is the
-simulator's business.
+In: a task and its ``Choices``: the robot's place, the object's, the drawer, the arrangement. They are drawn from a seed
+(``drawn``) or come from a published list (``published.py``). Out: a ``Layout`` (``lay_out``). Draws are made by NumPy's
+``RandomState`` alone, draw for draw as upstream does it (ManiSkill2_real2sim commit ef7a4d4, ``envs/custom_scenes``).
+Each class of upstream's hierarchy starts the episode's stream anew, so draws of different layers are made from equal
+streams: that is why several functions begin with a fresh ``RandomState(seed)``. Objects are given where they are
+dropped, half a metre above the table; where they end is the simulator's business.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
-from typing import TypedDict
+from types import MappingProxyType
+from typing import Any, TypedDict
 
 import numpy as np
 
-from vecenv.simpler.tasks import FIRST_SEED, NUM_EPISODES, ORIENTATIONS, SimplerTask
+from vecenv.simpler.tasks import DRAWERS, FIRST_SEED, NUM_EPISODES, ORIENTATIONS, SimplerTask
 
 Vector = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
@@ -29,12 +31,43 @@ DROP_HEIGHT = 0.5
 SINK = "sink"
 _SINK_POSITION: Vector = (-0.16, 0.13, 0.88)
 # Toy fruit weighs less than the models' files say; upstream overrides them in move_near only.
-_LIGHT_FRUIT = ("baked_apple", "baked_apple_v2", "orange")
+_LIGHT_FRUIT = ("apple", "baked_apple", "baked_apple_v2", "orange")
 _LIGHT_DENSITY = 200.0
 
 
 class LayoutError(ValueError):
     """A seed or episode that does not exist; the message says which do."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """What differs between the episodes of a task.
+
+    Attributes:
+        seed: of upstream's random stream.
+        drawn: whether the seed decided all of this; of a list's episodes it decides only where distractors lie.
+        robot_xy: where the robot's root link stands, metres, world frame.
+        robot_quat: of the root link, wxyz.
+        urdf_version: which of the robot's versions; "" is the plain one.
+        overlay: picture that replaces the background, in the asset tree; None where the drawn scene is shown.
+        model: of ``pick`` and ``place``, the object.
+        object_xy: of ``pick`` and ``place``, above which point the object is dropped, metres, world frame.
+        orientation: of ``pick``, how the object lies: one of ``ORIENTATIONS``.
+        episode_id: of ``move_near`` and ``put_on``, upstream's number of the arrangement.
+        drawer: of ``open``, ``close`` and ``place``, the drawer: one of ``DRAWERS``.
+    """
+
+    seed: int
+    drawn: bool = True
+    robot_xy: tuple[float, float]
+    robot_quat: Quat
+    urdf_version: str = ""
+    overlay: PurePosixPath | None = None
+    model: str = ""
+    object_xy: tuple[float, float] | None = None
+    orientation: str = ""
+    episode_id: int | None = None
+    drawer: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,13 +96,14 @@ class Layout:
 
     Attributes:
         task: the task's name.
-        seed: what it was drawn from.
+        seed: of upstream's random stream.
+        drawn: whether everything was drawn from it; see ``Choices``.
         objects: in upstream's order.
         base_position: of the robot's root link, metres, world frame.
         base_quat: wxyz.
         qpos: the robot's joints, radians and metres, in the order of ``Robot.joints``.
         urdf_version: which of the robot's versions.
-        overlay: picture that replaces the background, in the asset tree.
+        overlay: picture that replaces the background, in the asset tree; None where the drawn scene is shown.
         drawer: which drawer the task is about, "" when none.
         drawer_qpos: how far it is open at first, metres.
         instruction: what a policy is told at first.
@@ -80,12 +114,13 @@ class Layout:
 
     task: str
     seed: int
+    drawn: bool = True
     objects: tuple[Placed, ...]
     base_position: Vector
     base_quat: Quat
     qpos: tuple[float, ...]
     urdf_version: str = ""
-    overlay: PurePosixPath
+    overlay: PurePosixPath | None
     drawer: str = ""
     drawer_qpos: float = 0.0
     instruction: str
@@ -128,17 +163,38 @@ def episode_layout(task: SimplerTask, seed: int) -> Layout:
     Raises:
         LayoutError: the seed is out of range.
     """
+    return lay_out(task, drawn(task, seed))
+
+
+def drawn(task: SimplerTask, seed: int) -> Choices:
+    """What upstream's ``reset(seed=seed)`` draws; arguments and errors as of ``episode_layout``."""
     if not 0 <= seed < 2**32:
         raise LayoutError(f"seed {seed} is not between 0 and 2**32 - 1")
-    makers = {
-        "pick": _pick,
-        "move_near": _move_near,
-        "open": _drawer,
-        "close": _drawer,
-        "place": _place,
-        "put_on": _put_on,
-    }
-    return makers[task.family](task, seed)
+    drawer = {"open": _draw_station, "close": _draw_station, "place": _draw_place}
+    draws = {"pick": _draw_pick, "move_near": _draw_move_near, "put_on": _draw_put_on, **drawer}
+    return draws[task.family](task, seed)
+
+
+def lay_out(task: SimplerTask, choices: Choices) -> Layout:
+    """The episode of a task that choices lead to.
+
+    Raises:
+        LayoutError: an arrangement, drawer or orientation that the task does not have.
+    """
+    drawer = {"open": _drawer, "close": _drawer, "place": _place}
+    families = {"pick": _pick, "move_near": _move_near, "put_on": _put_on, **drawer}
+    height, qpos = _posture(task)
+    return Layout(
+        task=task.name,
+        seed=choices.seed,
+        drawn=choices.drawn,
+        base_position=(*choices.robot_xy, height),
+        base_quat=choices.robot_quat,
+        qpos=qpos,
+        urdf_version=choices.urdf_version,
+        overlay=choices.overlay,
+        **families[task.family](task, choices),
+    )
 
 
 def object_words(model: str) -> str:
@@ -165,74 +221,134 @@ _GOOGLE_QPOS = (
 )
 _WIDOWX_QPOS = (-0.01840777, 0.0398835, 0.22242722, -0.00460194, 1.36524296, 0.00153398, 0.037, 0.037)
 _SINK_QPOS = (-0.2600599, -0.12875618, 0.04461369, -0.00652761, 1.7033415, -0.26983038, 0.037, 0.037)
-_WIDOWX_BASE: Vector = (0.147, 0.028, 0.87)
-_SINK_BASE: Vector = (0.127, 0.06, 0.85)
-# The base's own height and the floor's.
-_GOOGLE_HEIGHT = 0.06205 + 0.017
+# Heights of the base: WidowX at the table, at the sink; the Google Robot's, which is its own and the floor's.
+_WIDOWX_HEIGHT, _SINK_HEIGHT, _GOOGLE_HEIGHT = 0.87, 0.85, 0.06205 + 0.017
 _TURNED: Quat = (0.0, 0.0, 0.0, 1.0)
+Station = tuple[float, float, float]
+WIDOWX_STATION: Station = (0.147, 0.028, 0.0)
+"""Where a robot stands: x, y (metres) and yaw (radians)."""
+SINK_STATION: Station = (0.127, 0.06, 0.0)
+PICK_STATION: Station = (0.35, 0.20, 0.0)
+MOVE_NEAR_STATION: Station = (0.35, 0.21, -0.09)
+DRAWER_STATIONS: Mapping[str, Station] = MappingProxyType(
+    {
+        "a0": (0.644, -0.179, -0.03),
+        "a1": (0.765, -0.182, -0.02),
+        "a2": (0.889, -0.203, -0.06),
+        "b0": (0.652, 0.009, 0.0),
+        "b1": (0.752, 0.009, 0.0),
+        "b2": (0.851, 0.035, 0.0),
+        "c0": (0.665, 0.224, 0.0),
+        "c1": (0.765, 0.222, -0.025),
+        "c2": (0.865, 0.222, -0.025),
+    }
+)
+"""Where the real robot stood when the pictures of the drawers were taken."""
 
-# Where the real robot stood when the pictures of the drawers were taken: x, y (metres) and yaw (radians).
-_STATIONS = {
-    "a0": (0.644, -0.179, -0.03),
-    "a1": (0.765, -0.182, -0.02),
-    "a2": (0.889, -0.203, -0.06),
-    "b0": (0.652, 0.009, 0.0),
-    "b1": (0.752, 0.009, 0.0),
-    "b2": (0.851, 0.035, 0.0),
-    "c0": (0.665, 0.224, 0.0),
-    "c1": (0.765, 0.222, -0.025),
-    "c2": (0.865, 0.222, -0.025),
-}
+
+class Stand(TypedDict):
+    """The robot's place, as ``Choices`` has it."""
+
+    robot_xy: tuple[float, float]
+    robot_quat: Quat
 
 
-class _Base(TypedDict):
-    base_position: Vector
-    base_quat: Quat
+def stand(station: Station) -> Stand:
+    """A robot's place: yaw is added to the half turn by which the robots face their tables."""
+    x, y, yaw = station
+    return {"robot_xy": (x, y), "robot_quat": _multiply(_yaw(yaw), _TURNED)}
 
 
-def _google_base(x: float, y: float, yaw: float = 0.0) -> _Base:
-    return {"base_position": (x, y, _GOOGLE_HEIGHT), "base_quat": _multiply(_yaw(yaw), _TURNED)}
+def put_on_station(task: SimplerTask) -> Station:
+    """Where WidowX stands in a task of ``put_on``."""
+    return SINK_STATION if _at_sink(task) else WIDOWX_STATION
+
+
+def _at_sink(task: SimplerTask) -> bool:
+    return task.name == "widowx_put_eggplant_in_basket"
+
+
+def _posture(task: SimplerTask) -> tuple[float, tuple[float, ...]]:
+    """Height of the base, metres, and the joints at the beginning."""
+    if task.family != "put_on":
+        return _GOOGLE_HEIGHT, _GOOGLE_QPOS
+    return (_SINK_HEIGHT, _SINK_QPOS) if _at_sink(task) else (_WIDOWX_HEIGHT, _WIDOWX_QPOS)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Families.
 
 
-def _pick(task: SimplerTask, seed: int) -> Layout:
+def _draw_pick(task: SimplerTask, seed: int) -> Choices:
     orientation = task.orientation or str(_stream(seed).choice(list(ORIENTATIONS)))
     rng = _stream(seed)
     model = _choice(task.models, rng)
     version = str(rng.choice(list(task.robot.versions)))
     x, y = _stream(seed).uniform([-0.35, -0.02], [-0.12, 0.42], [2])
-    turns = {"upright": _roll(math.pi / 2), "laid_vertically": _yaw(math.pi / 2), "lr_switch": _yaw(math.pi)}
-    return Layout(
-        task=task.name,
+    return Choices(
         seed=seed,
-        objects=(Placed(model=model, role="source", position=_drop(task, x, y), quat=turns[orientation]),),
-        **_google_base(0.35, 0.20),
-        qpos=_GOOGLE_QPOS,
+        **stand(PICK_STATION),
         urdf_version=version,
         overlay=task.overlays[0],
-        instruction=f"pick {object_words(model)}",
+        model=model,
+        object_xy=(float(x), float(y)),
         orientation=orientation,
     )
 
 
+def _pick(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+    turns = {"upright": _roll(math.pi / 2), "laid_vertically": _yaw(math.pi / 2), "lr_switch": _yaw(math.pi)}
+    quat = turns[_known("orientation", choices.orientation, turns)]
+    return {
+        "objects": (_source(task, choices, quat),),
+        "instruction": f"pick {object_words(choices.model)}",
+        "orientation": choices.orientation,
+    }
+
+
+def _source(task: SimplerTask, choices: Choices, quat: Quat) -> Placed:
+    if choices.object_xy is None or not choices.model:
+        raise LayoutError(f"{task.name} needs an object and its place")
+    return Placed(model=choices.model, role="source", position=_drop(task, *choices.object_xy), quat=quat)
+
+
 _PAIRS = tuple(itertools.permutations(range(3), 2))
 _TRIANGLES = (((-0.33, 0.04), (-0.33, 0.34), (-0.13, 0.19)), ((-0.13, 0.04), (-0.33, 0.19), (-0.13, 0.34)))
+_PER_TRIPLET = len(_PAIRS) * len(_TRIANGLES)
 
 
-def _move_near(task: SimplerTask, seed: int) -> Layout:
-    per_triplet = len(_PAIRS) * len(_TRIANGLES)
-    episode = int(_stream(seed).randint(len(task.triplets) * per_triplet))
-    version = str(_stream(seed).choice(list(task.robot.versions)))
-    triplet, corners = task.triplets[episode // per_triplet], _TRIANGLES[episode % per_triplet // len(_PAIRS)]
+def _draw_move_near(task: SimplerTask, seed: int) -> Choices:
+    return Choices(
+        seed=seed,
+        **stand(MOVE_NEAR_STATION),
+        urdf_version=str(_stream(seed).choice(list(task.robot.versions))),
+        overlay=task.overlays[0],
+        episode_id=int(_stream(seed).randint(num_arrangements(task))),
+    )
+
+
+def num_arrangements(task: SimplerTask) -> int:
+    """How many numbers upstream gives to the arrangements of a task of ``move_near`` or ``put_on``; 0 for others."""
+    if task.family == "put_on":
+        places, turns = _put_on_choices(task.name)
+        return len(places) * len(turns)
+    return len(task.triplets) * _PER_TRIPLET
+
+
+def _arrangement(task: SimplerTask, choices: Choices) -> int:
+    number, count = choices.episode_id, num_arrangements(task)
+    if number is None or not 0 <= number < count:
+        raise LayoutError(f"{task.name} has no arrangement {number}; there are {count} (0 to {count - 1})")
+    return number
+
+
+def _move_near(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+    episode = _arrangement(task, choices)
+    triplet, corners = task.triplets[episode // _PER_TRIPLET], _TRIANGLES[episode % _PER_TRIPLET // len(_PAIRS)]
     source, target = _PAIRS[episode % len(_PAIRS)]
     roles = {source: "source", target: "target"}
-    return Layout(
-        task=task.name,
-        seed=seed,
-        objects=tuple(
+    return {
+        "objects": tuple(
             Placed(
                 model=model,
                 role=roles.get(i, "other"),
@@ -242,13 +358,9 @@ def _move_near(task: SimplerTask, seed: int) -> Layout:
             )
             for i, model in enumerate(triplet)
         ),
-        **_google_base(0.35, 0.21, -0.09),
-        qpos=_GOOGLE_QPOS,
-        urdf_version=version,
-        overlay=task.overlays[0],
-        instruction=f"move {object_words(triplet[source])} near {object_words(triplet[target])}",
-        episode_id=episode,
-    )
+        "instruction": f"move {object_words(triplet[source])} near {object_words(triplet[target])}",
+        "episode_id": episode,
+    }
 
 
 def _standing(model: str) -> Quat:
@@ -260,74 +372,64 @@ def _standing(model: str) -> Quat:
     return _multiply(_yaw(math.pi / 2), _roll(math.pi / 2)) if "bottle" in model else _yaw(math.pi / 2)
 
 
-def _drawer(task: SimplerTask, seed: int) -> Layout:
-    drawer, overlay, version = _draw_station(task, seed)
-    return Layout(
-        task=task.name,
-        seed=seed,
-        objects=(),
-        **_google_base(*_STATIONS[_station_name(overlay)]),
-        qpos=_GOOGLE_QPOS,
-        urdf_version=version,
-        overlay=overlay,
-        drawer=drawer,
-        drawer_qpos=getattr(task.success, "start", 0.0),
-        instruction=f"{task.family} {drawer} drawer",
-    )
-
-
-def _place(task: SimplerTask, seed: int) -> Layout:
-    model = _choice(task.models, _stream(seed))
-    drawer, overlay, version = _draw_station(task, seed)
-    x, y = _stream(seed).uniform([-0.10, -0.00], [-0.05, 0.1], [2])
-    return Layout(
-        task=task.name,
-        seed=seed,
-        objects=(Placed(model=model, role="source", position=_drop(task, x, y), quat=_UPRIGHT),),
-        **_google_base(*_STATIONS[_station_name(overlay)]),
-        qpos=_GOOGLE_QPOS,
-        urdf_version=version,
-        overlay=overlay,
-        drawer=drawer,
-        instruction=f"open {drawer} drawer",
-        second_instruction=f"place {object_words(model)} into {drawer} drawer",
-    )
-
-
-def _draw_station(task: SimplerTask, seed: int) -> tuple[str, PurePosixPath, str]:
+def _draw_station(task: SimplerTask, seed: int) -> Choices:
     """Drawer, picture and URDF version, drawn from one stream."""
     rng = _stream(seed)
     drawer = str(rng.choice(list(task.drawers)))
     overlay = task.overlays[int(rng.choice(len(task.overlays)))]
-    return drawer, overlay, str(rng.choice(list(task.robot.versions)))
+    station = DRAWER_STATIONS[overlay.stem.rsplit("_", 1)[-1]]
+    version = str(rng.choice(list(task.robot.versions)))
+    return Choices(seed=seed, **stand(station), urdf_version=version, overlay=overlay, drawer=drawer)
 
 
-def _station_name(overlay: PurePosixPath) -> str:
-    return overlay.stem.rsplit("_", 1)[-1]
+def _drawer(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+    drawer = _known("drawer", choices.drawer, DRAWERS)
+    return {
+        "objects": (),
+        "drawer": drawer,
+        "drawer_qpos": getattr(task.success, "start", 0.0),
+        "instruction": f"{task.family} {drawer} drawer",
+    }
 
 
-def _put_on(task: SimplerTask, seed: int) -> Layout:
-    sink = task.name == "widowx_put_eggplant_in_basket"
+def _draw_place(task: SimplerTask, seed: int) -> Choices:
+    model = _choice(task.models, _stream(seed))
+    x, y = _stream(seed).uniform([-0.10, -0.00], [-0.05, 0.1], [2])
+    return replace(_draw_station(task, seed), model=model, object_xy=(float(x), float(y)))
+
+
+def _place(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+    drawer = _known("drawer", choices.drawer, DRAWERS)
+    return {
+        "objects": (_source(task, choices, _UPRIGHT),),
+        "drawer": drawer,
+        "instruction": f"open {drawer} drawer",
+        "second_instruction": f"place {object_words(choices.model)} into {drawer} drawer",
+    }
+
+
+def _known(what: str, value: str, there: Iterable[str]) -> str:
+    if value not in there:
+        raise LayoutError(f"{what}={value!r}: expected one of {', '.join(there)}")
+    return value
+
+
+def _draw_put_on(task: SimplerTask, seed: int) -> Choices:
+    episode = int(_stream(seed).randint(num_arrangements(task)))
+    return Choices(seed=seed, **stand(put_on_station(task)), overlay=task.overlays[0], episode_id=episode)
+
+
+def _put_on(task: SimplerTask, choices: Choices) -> dict[str, Any]:
     corners, turns = _put_on_choices(task.name)
-    episode = int(_stream(seed).randint(len(corners) * len(turns)))
+    episode = _arrangement(task, choices)
     places, turn = corners[episode // len(turns)], turns[episode % len(turns)]
     objects = [
         Placed(model=model, role=role, position=_drop(task, *xy), quat=quat)
         for model, role, xy, quat in zip(task.models, ("source", "target"), places, (turn, _UPRIGHT), strict=True)
     ]
-    if sink:
+    if _at_sink(task):
         objects.append(Placed(model=SINK, role="fixture", position=_SINK_POSITION, quat=_UPRIGHT))
-    return Layout(
-        task=task.name,
-        seed=seed,
-        objects=tuple(objects),
-        base_position=_SINK_BASE if sink else _WIDOWX_BASE,
-        base_quat=_TURNED,
-        qpos=_SINK_QPOS if sink else _WIDOWX_QPOS,
-        overlay=task.overlays[0],
-        instruction=task.instruction,
-        episode_id=episode,
-    )
+    return {"objects": tuple(objects), "instruction": task.instruction, "episode_id": episode}
 
 
 _XY = tuple[float, float]

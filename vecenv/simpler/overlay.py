@@ -24,7 +24,7 @@ import numpy as np
 import sapien
 from PIL import Image
 
-from vecenv.simpler.episodes import Episode
+from vecenv.simpler.episodes import Episode, drawn_stage, require_drawable
 from vecenv.simpler.scenes import CABINET, ROBOT, Scene, SceneSpec, instances
 from vecenv.simpler.tasks import Camera, Lighting
 
@@ -139,7 +139,8 @@ class Style:
     Attributes:
         overlay: ``"background"``, upstream's visual matching; ``"none"``, the drawn scene; or ``"blend"``, both at one
             half, to see how well they match.
-        shadows: lights that can cast shadows do; upstream leaves them off.
+        shadows: lights that can cast shadows do; else only those that do upstream, the ones around cabinets of variant
+            aggregation.
     """
 
     overlay: str = "background"
@@ -155,7 +156,7 @@ class Subject:
         camera, lighting: of the task.
         shiny, matte: what upstream does to the robot's and to objects' materials.
         hidden: objects that the photograph replaces.
-        photo: file of the photograph.
+        photo: file of the photograph; None where there is none, and the drawn scene is shown.
     """
 
     spec: SceneSpec
@@ -164,21 +165,26 @@ class Subject:
     shiny: bool
     matte: bool
     hidden: frozenset[str]
-    photo: Path
+    photo: Path | None
 
     @classmethod
     def of(cls, episode: Episode, root: Path) -> Subject:
-        """Of an episode; ``root`` is that of the asset tree."""
+        """Of an episode; ``root`` is that of the asset tree.
+
+        Raises:
+            AssetsMissing: a file that only pictures need is not there; the message names it.
+        """
         task, layout = episode.task, episode.layout
+        require_drawable(episode, root)
         urdf = root / task.robot.urdf_path(layout.urdf_version)
         return cls(
-            spec=replace(episode.spec, robot=replace(episode.spec.robot, urdf=urdf)),
+            spec=replace(episode.spec, robot=replace(episode.spec.robot, urdf=urdf), stage=drawn_stage(episode, root)),
             camera=task.camera,
             lighting=task.lighting,
             shiny=task.shiny,
             matte=task.matte,
             hidden=frozenset(task.always_overlaid),
-            photo=root / layout.overlay,
+            photo=root / layout.overlay if layout.overlay else None,
         )
 
 
@@ -201,7 +207,7 @@ class Painter:
             RendererMissing: no Vulkan driver.
         """
         colours = self._twin(subject).draw(facts, subject.hidden, out)
-        if self.style.overlay == "none":
+        if self.style.overlay == "none" or subject.photo is None:
             out.rgb[:] = colours[..., :3]
             return
         height, width = out.segmentation.shape
@@ -214,7 +220,7 @@ class Painter:
         out.rgb.reshape(-1, 3)[shown] = colours.reshape(-1, colours.shape[-1])[shown, :3]
 
     def _twin(self, subject: Subject) -> _Twin:
-        key = (subject.spec, subject.camera, subject.lighting, subject.matte)
+        key = (subject.spec, subject.camera, subject.lighting, subject.shiny, subject.matte)
         if key not in self._twins:
             self._twins[key] = _Twin(subject, self.style.shadows)
             while len(self._twins) > _TWINS:
@@ -232,6 +238,7 @@ class _Twin:
 
     def __init__(self, subject: Subject, shadows: bool) -> None:
         check_renderer()
+        shadows = shadows or subject.lighting.casts
         self._scene = Scene(subject.spec, visuals=True)
         self._names = instances(subject.spec)
         _light(self._scene.sapien, subject.lighting, shadows)

@@ -120,12 +120,16 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """The surroundings: a mesh at a pose (``mesh_pose`` turns the mesh, ``offset`` is subtracted), or boxes."""
+    """The surroundings: a mesh at a pose (``mesh_pose`` turns the mesh, ``offset`` is subtracted), or boxes.
+
+    A mesh that is not ``solid`` is only drawn.
+    """
 
     mesh: Path | None = None
     mesh_pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.707, 0.707, 0.0, 0.0)
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     boxes: tuple[Box, ...] = ()
+    solid: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,7 +273,8 @@ class Scene:
         material = physx.PhysxMaterial(1.0, 1.0, 0.0)
         if stage.mesh is not None:
             pose = pose_of(stage.mesh_pose)
-            builder.add_nonconvex_collision_from_file(str(stage.mesh), pose, material=material)
+            if stage.solid:
+                builder.add_nonconvex_collision_from_file(str(stage.mesh), pose, material=material)
             if self._visuals:
                 builder.add_visual_from_file(str(stage.mesh), pose)
         for box in stage.boxes:

@@ -93,10 +93,11 @@ class DirectionalLight:
 
 @dataclass(frozen=True, kw_only=True)
 class Lighting:
-    """Light of a scene: ``ambient`` colour and the directional lights."""
+    """Light of a scene: ``ambient`` colour and the directional lights; ``casts``: they cast shadows upstream."""
 
     ambient: tuple[float, float, float]
     directional: tuple[DirectionalLight, ...] = ()
+    casts: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,11 +108,15 @@ class Stage:
         name: stem of its mesh among the stages, or None for a bare floor that is only drawn.
         offset: its origin is put at minus this, metres.
         table_height: objects are dropped from half a metre above, metres, world frame.
+        turn: pose of the mesh in the stage's frame, xyz and wxyz, not normalised (as upstream has it).
+        solid: whether it has collision shapes; the rooms around cabinets are only drawn.
     """
 
     name: str | None
     offset: tuple[float, float, float]
     table_height: float = 0.87
+    turn: tuple[float, ...] = (0.0, 0.0, 0.0, 0.707, 0.707, 0.0, 0.0)
+    solid: bool = True
 
     @property
     def mesh(self) -> PurePosixPath | None:
@@ -424,11 +429,11 @@ PLACE_MODELS = (
 )
 
 
-def _triplets(suffix: str) -> tuple[tuple[str, str, str], ...]:
+def _triplets(prefix: str, suffix: str = "") -> tuple[tuple[str, str, str], ...]:
     pepsi, seven_up, coke, redbull = (
-        f"baked_opened_{brand}_can{suffix}" for brand in ("pepsi", "7up", "coke", "redbull")
+        f"{prefix}opened_{brand}_can{suffix}" for brand in ("pepsi", "7up", "coke", "redbull")
     )
-    apple, sponge = f"baked_apple{suffix}", f"baked_sponge{suffix}"
+    apple, sponge = f"{prefix}apple{suffix}", f"{prefix}sponge{suffix}"
     return (
         ("blue_plastic_bottle", pepsi, "orange"),
         (seven_up, apple, sponge),
@@ -436,6 +441,12 @@ def _triplets(suffix: str) -> tuple[tuple[str, str, str], ...]:
         (sponge, "blue_plastic_bottle", seven_up),
         ("orange", pepsi, redbull),
     )
+
+
+PLAIN_TRIPLETS = _triplets("")
+"""Groups of ``move_near`` in variant aggregation: visual matching's without the light baked into their textures."""
+PLAIN_MODELS_FILE = "info_pick_custom_v0.json"
+"""Sizes and densities of the objects of ``pick`` and of those groups."""
 
 
 def _google(name: str, family: str, instruction: str, success: Success, **fields: Any) -> dict[str, Any]:
@@ -460,7 +471,7 @@ def _pick(name: str, instruction: str, models: tuple[str, ...], orientation: str
         max_steps=80,
         models=models,
         orientation=orientation,
-        models_file="info_pick_custom_v0.json",
+        models_file=PLAIN_MODELS_FILE,
         stage=COKE_TABLE,
         overlays=(_picture("google_coke_can_real_eval_1"),),
         lighting=TABLE_LIGHT,
@@ -474,7 +485,7 @@ def _move_near(name: str, version: int) -> dict[str, Any]:
         "move SOURCE near TARGET",
         MoveNearSuccess(),
         max_steps=80,
-        triplets=_triplets("" if version == 0 else "_v2"),
+        triplets=_triplets("baked_", "" if version == 0 else "_v2"),
         models_file=f"info_pick_custom_baked_tex_v{version}.json",
         stage=COKE_TABLE,
         contact_offset=0.005,
@@ -642,18 +653,28 @@ def _by_name(suite: str, name: str, tasks: Iterable[SimplerTask]) -> SimplerTask
     return names[name]
 
 
-def eval_metadata(suite: str) -> dict[str, Any]:
+def eval_metadata(suite: str, protocol: str = "seed") -> dict[str, Any]:
     """What an evaluation of a suite consists of, with the keys of ``vecenv.eval_metadata``; budgets are a task's own.
+
+    Args:
+        suite: the suite.
+        protocol: one of ``published.PROTOCOLS``. Under upstream's lists ``episodes_per_task`` is a tuple, one number a
+            task, 0 where upstream has none.
 
     Raises:
         UnknownSuite: no such suite.
+        PublishedError: no such protocol, or it has no episodes of this suite.
     """
-    tasks = list_tasks(suite)
+    from vecenv.simpler import published  # it builds on this module
+
+    tasks, there = list_tasks(suite), published.counts(protocol, suite)
+    counts = tuple(there.get(task.index, 0) for task in tasks)
     return {
         "suite": suite,
+        "protocol": protocol,
         "num_tasks": len(tasks),
-        "episodes_per_task": NUM_EPISODES,
-        "num_episodes": len(tasks) * NUM_EPISODES,
+        "episodes_per_task": NUM_EPISODES if protocol == published.SEED else counts,
+        "num_episodes": sum(counts),
         "max_steps": tuple(task.max_steps for task in tasks),
         "metrics": ("success", "num_steps", "cumulative_reward"),
         "action_space": ("step_continuous", "step_ee_pose"),

@@ -1,9 +1,10 @@
 """Variants of SIMPLER's Google Robot scenes: another light, cabinet, table or room, a turned camera, more objects.
 
 In: a ``Variant`` and an episode's task and layout. Out: both, changed (``varied``). The values are those of upstream's
-variant aggregation (SimplerEnv commit 4ab7178, ``scripts/*_variant_agg.sh``; ManiSkill2_real2sim commit ef7a4d4), put
-on the episodes of visual matching: upstream draws variant aggregation's own from grids of robot and object positions.
-It shows the drawn scene, so ``overlay="none"`` belongs to most of these.
+variant aggregation (SimplerEnv commit 4ab7178, ``scripts/*_variant_agg.sh``; ManiSkill2_real2sim commit ef7a4d4). With
+``make(variant=...)`` they are put on episodes that seeds decide, where ``overlay="none"`` belongs to most of them;
+upstream's own episodes, on grids of robot and object positions, are ``make(protocol="variant-aggregation")``
+(``published.py``).
 """
 
 from __future__ import annotations
@@ -11,21 +12,20 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from vecenv.assets import AssetsMissing
-from vecenv.simpler.assets import NAME
+from vecenv.simpler.assets import NAME, how_to_get
 from vecenv.simpler.layouts import Layout, Placed
 from vecenv.simpler.tasks import DATA, DirectionalLight, Lighting, SimplerTask, Stage
 
 _ON_TABLE, _AT_CABINET = ("pick", "move_near"), ("open", "close", "place")
 _GOOGLE_FAMILIES = (*_ON_TABLE, *_AT_CABINET)
 _COKE = "opened_coke_can"
-_FROM_UPSTREAM = "copy it from ManiSkill2_real2sim's repository; `vecenv assets pull` knows what visual matching needs"
 _AMBIENT = (0.3, 0.3, 0.3)
 
 
@@ -39,7 +39,7 @@ def _sun(x: float, y: float, z: float, brightness: float, shadow: bool = False) 
 
 def _room(brightness: float) -> Lighting:
     sides = (_sun(-1, 1, -0.05, 0.5), _sun(-1, -1, -0.05, 0.5))
-    return Lighting(ambient=_AMBIENT, directional=(_sun(-0.2, 0, -1, brightness, shadow=True), *sides))
+    return Lighting(ambient=_AMBIENT, directional=(_sun(-0.2, 0, -1, brightness, shadow=True), *sides), casts=True)
 
 
 TABLE_LIGHTS: Mapping[str, Lighting] = MappingProxyType(
@@ -55,7 +55,8 @@ TABLE_LIGHTS: Mapping[str, Lighting] = MappingProxyType(
 CABINET_LIGHTS: Mapping[str, Lighting] = MappingProxyType(
     {"room": _room(1.0), "brighter": _room(2.0), "darker": _room(0.5)}
 )
-"""Light of ``open``, ``close`` and ``place``; ``room`` is variant aggregation's own, the others vary that."""
+"""Light of ``open``, ``close`` and ``place``; ``room`` is variant aggregation's own, the others vary that. It casts
+shadows, as upstream's does."""
 STATIONS = ("mk_station", "mk_station2", "mk_station3", "mk_station4")
 """Cabinets beside visual matching's ``mk_station_recolor``."""
 STAGES = (
@@ -64,7 +65,7 @@ STAGES = (
     "google_pick_coke_can_1_v4_alt_background",
     "google_pick_coke_can_1_v4_alt_background_2",
 )
-"""Tables and rooms of ``pick`` and ``move_near``; their files are not among those that ``assets pull`` knows."""
+"""Tables and rooms of ``pick`` and ``move_near``; ``vecenv assets pull simpler-variants`` fetches their files."""
 CAMERAS: Mapping[str, float] = MappingProxyType({"lower": 0.9351361, "higher": 0.6651361})
 """Tilt of the head, radians; 0.7851361 otherwise."""
 DISTRACTORS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -133,18 +134,16 @@ def varied(task: SimplerTask, layout: Layout, variant: Variant | None) -> tuple[
     return changed, _with_objects(changed, _with_camera(layout, variant), variant)
 
 
-def require_files(task: SimplerTask, root: Path) -> None:
-    """Whether the meshes that the cabinet is drawn with are there; some of upstream's cabinets have one.
+def station_meshes(station: PurePosixPath, root: Path) -> tuple[PurePosixPath, ...]:
+    """Meshes that a cabinet of the asset tree is drawn with, paths in the tree; some of upstream's cabinets have one.
 
     Raises:
-        AssetsMissing: one is not; the message names it.
+        AssetsMissing: there is no such cabinet; the message names the file.
     """
-    if task.station is None or not (root / task.station).is_file():
-        return
-    folder = task.station.parent
-    for name in dict.fromkeys(mesh.attrib["filename"] for mesh in ET.parse(root / task.station).iter("mesh")):
-        if not (root / folder / name).is_file():
-            raise AssetsMissing(NAME, f"{root} has no {folder / name}, a part of {task.station.name}", _FROM_UPSTREAM)
+    if not (root / station).is_file():
+        raise AssetsMissing(NAME, f"{root} has no {station}", how_to_get(station))
+    names = (mesh.attrib["filename"] for mesh in ET.parse(root / station).iter("mesh"))
+    return tuple(station.parent / name for name in dict.fromkeys(names))
 
 
 def _task_changes(task: SimplerTask, variant: Variant) -> dict[str, Any]:
@@ -183,15 +182,16 @@ def _with_objects(task: SimplerTask, layout: Layout, variant: Variant) -> Layout
     known = tuple(DISTRACTORS) if can else ("none",) if task.family == "move_near" else ()
     _chosen(task, "distractors", variant.distractors, {each: each for each in known})
     if not can:
-        return replace(layout, objects=tuple(placed for placed in layout.objects if placed.role != "other"))
+        return replace(layout, objects=(*layout.with_role("source"), *layout.with_role("target")))
     return replace(layout, objects=(*layout.objects, *_beside(layout, DISTRACTORS[variant.distractors])))
 
 
 def _beside(layout: Layout, models: tuple[str, ...]) -> list[Placed]:
-    """Distractors, drawn as upstream does: from the stream that the can's place came from."""
+    """Distractors, drawn as upstream does: from the stream that the can's place came from, if that was drawn."""
     can = layout.objects[0]
-    rng = np.random.RandomState(layout.seed)
-    middle = rng.uniform([-0.35, -0.02], [-0.12, 0.42], [2])
+    rng, middle = np.random.RandomState(layout.seed), np.array(can.position[:2])
+    if layout.drawn:
+        rng.uniform(size=2)
     found = []
     for model in models:
         place = middle
