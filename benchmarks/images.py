@@ -4,9 +4,9 @@
 
 The peer's Python writes upstream's images and the states they show to a folder (``benchmarks/images_peer.py``, once);
 the same states, fixtures in the same places, are then shown by vecenv, and each image is compared. A scene's number
-is its worst image's: three moments (of rays two), two cameras. ``exact`` and ``fast`` are levels of detail in GL; ``rays`` is
-``engine="raytrace"``, which takes a minute a scene on a CPU and by default is run in one scene of each workspace;
-``current`` is what the installed MuJoCo shows, for comparison.
+is its worst image's: three moments (of rays two), two cameras. ``exact`` and ``fast`` are levels of detail in GL;
+``rays`` is ``engine="raytrace"``, slow on a CPU and by default run in one scene of each workspace; ``current`` is what
+the installed MuJoCo shows, for comparison.
 """
 
 from __future__ import annotations
@@ -14,29 +14,23 @@ from __future__ import annotations
 import argparse
 import os
 import subprocess
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from common import ROOT, report
-from images_peer import CAMERAS, MOMENTS
-from pictures import psnr
+from images_peer import MOMENTS
+from pictures import Reference, agreement
 
-import vecenv
-from vecenv.contract import Egocentric
 from vecenv.libero import suites
 from vecenv.libero.bddl import SceneKey
-from vecenv.libero.env import LiberoEnv
 from vecenv.render.gl import choose
 from vecenv.render.options import RenderConfig
 
 PUBLISHED = "3.3.0"
 REFERENCES = ROOT / "build" / "upstream_images"
 # Rays are not compared in the last one: they draw no sky, which is what an arm somewhere else may look at.
-RAY_MOMENTS = MOMENTS[:2]
+RAY_MOMENTS = 2
 # What the project promises of every image, dB.
 ENOUGH = {"exact": 40.0, "fast": 32.0, "rays": 24.0}
 RENDER = {
@@ -45,29 +39,6 @@ RENDER = {
     "rays": RenderConfig(lod="fast", engine="raytrace"),
     "current": RenderConfig(lod="exact", colors="current"),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reference:
-    """Upstream's images of one scene.
-
-    Attributes:
-        images: uint8 [moments, cameras, 256, 256, 3]. qpos, qvel: [moments, n].
-        fixtures: by name, position and orientation. episode: the start state.
-    """
-
-    images: np.ndarray
-    qpos: np.ndarray
-    qvel: np.ndarray
-    fixtures: dict[str, tuple[np.ndarray, np.ndarray]]
-
-    @classmethod
-    def load(cls, path: Path) -> Reference:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        poses = zip(arrays["fixture_pos"], arrays["fixture_quat"], strict=True)
-        fixtures = dict(zip(arrays["fixtures"].tolist(), poses, strict=True))
-        return cls(images=arrays["images"], qpos=arrays["qpos"], qvel=arrays["qvel"], fixtures=fixtures)
 
 
 def scenes() -> dict[str, str]:
@@ -88,38 +59,6 @@ def write_references(peer: Path, folder: Path, names: Sequence[str]) -> None:
     subprocess.run(command, check=True, env={**os.environ, "PYTHONPATH": paths, "MUJOCO_GL": choose()})
 
 
-@contextmanager
-def environment(name: str, reference: Reference, render: RenderConfig) -> Iterator[LiberoEnv]:
-    """An environment of a scene, its fixtures where upstream's stand."""
-    suite, task = name.rsplit("-", 1)
-    options: Any = {"fixtures": reference.fixtures, "start": "raw", "settle_steps": 0}
-    env = vecenv.make(suite, task=int(task), episodes=[0], render=render, **options)
-    assert isinstance(env, LiberoEnv)
-    try:
-        env.reset()
-        yield env
-    finally:
-        env.close()
-
-
-def images(name: str, reference: Reference, render: RenderConfig) -> np.ndarray:
-    """The reference's images as vecenv draws them, uint8 [moments, cameras, 256, 256, 3]."""
-    with environment(name, reference, render) as env:
-        found = []
-        for qpos, qvel in zip(reference.qpos, reference.qvel, strict=True):
-            env.set_state(qpos=qpos[None], qvel=qvel[None])
-            seen = env.observe_egocentric()
-            assert isinstance(seen, Egocentric)
-            found.append([seen.images[camera][0] for camera in CAMERAS])
-    return np.array(found)
-
-
-def agreement(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """PSNR of each image, dB, [moments, cameras]; equal ones count as 100."""
-    pairs = zip(ours, theirs, strict=True)
-    return np.array([[min(psnr(a, b), 100.0) for a, b in zip(x, y, strict=True)] for x, y in pairs])
-
-
 def row(name: str, workspace: str, reference: Reference, kinds: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {
         "scene": name,
@@ -127,8 +66,8 @@ def row(name: str, workspace: str, reference: Reference, kinds: Sequence[str]) -
     }
     for kind in RENDER:
         if kind in kinds:
-            seen = agreement(images(name, reference, RENDER[kind]), reference.images)
-            seen = seen[: len(RAY_MOMENTS)] if kind == "rays" else seen
+            moments = range(RAY_MOMENTS if kind == "rays" else len(MOMENTS))
+            seen = agreement(reference.drawn(RENDER[kind], moments), reference.images[moments])
             found[kind] = round(float(seen.min()), 1)
         else:
             found[kind] = None
@@ -161,13 +100,13 @@ def main() -> None:
     rows = []
     for name in names:
         kinds = [kind for kind in RENDER if kind != "rays" or name in traced[options.rays]]
-        rows.append(row(name, every[name], Reference.load(options.references / f"{name}.npz"), kinds))
+        rows.append(row(name, every[name], Reference.load(options.references, name), kinds))
     lowest = {
         kind: min((each[kind], each["scene"]) for each in rows if each[kind] is not None)
         for kind in RENDER
         if any(each[kind] is not None for each in rows)
     }
-    moments = {"moments": MOMENTS, "ray_moments": RAY_MOMENTS}
+    moments = {"moments": MOMENTS, "ray_moments": MOMENTS[:RAY_MOMENTS]}
     notes = {"upstream_mujoco": PUBLISHED, **moments, "unit": "dB, the scene's worst image", "lowest": lowest}
     report(options.out, rows, title=f"Images against upstream under MuJoCo {PUBLISHED}", notes=notes)
     if failed := {kind: lowest[kind] for kind in ENOUGH if kind in lowest and lowest[kind][0] < ENOUGH[kind]}:

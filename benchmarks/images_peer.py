@@ -24,19 +24,20 @@ TICKS = 10
 FORMAT = 1
 
 
-def about(episode: int, size: int) -> dict[str, Any]:
-    return {"format": FORMAT, "mujoco": mujoco.__version__, "episode": episode, "size": size, "ticks": TICKS}
+def about(episode: int, size: int, moments: int) -> dict[str, Any]:
+    made = {"format": FORMAT, "mujoco": mujoco.__version__, "episode": episode, "size": size, "ticks": TICKS}
+    return {**made, "moments": MOMENTS[:moments]}
 
 
 def is_current(path: Path, wanted: dict[str, Any]) -> bool:
     if not path.exists():
         return False
     with np.load(path, allow_pickle=False) as file:
-        return json.loads(str(file["about"])) == wanted
+        return json.loads(str(file["about"])) == json.loads(json.dumps(wanted))
 
 
-def record(suite: str, task: int, episode: int, size: int) -> dict[str, np.ndarray]:
-    """The arrays of one scene's file, without ``about``."""
+def record(suite: str, task: int, episode: int, size: int, moments: int) -> dict[str, np.ndarray]:
+    """The arrays of one scene's file, without ``about``, of the first so many moments."""
     import upstream
 
     from vecenv.libero import suites
@@ -55,7 +56,7 @@ def record(suite: str, task: int, episode: int, size: int) -> dict[str, np.ndarr
         peer.step(upstream.random_action(rng))
     states.append((data.qpos.copy(), data.qvel.copy()))
     states.append((upstream.shuffled(model, data.qpos, rng), np.zeros_like(data.qvel)))
-    images = []
+    states, images = states[:moments], []
     for qpos, qvel in states:
         seen = peer.set_init_state(np.concatenate([[0.0], qpos, qvel]))
         images.append([seen[key][::-1, ::-1] for key in CAMERAS.values()])
@@ -76,18 +77,19 @@ def main() -> None:
     parser.add_argument("--mujoco", required=True, help="the version this Python must have")
     parser.add_argument("--episode", type=int, default=0)
     parser.add_argument("--size", type=int, default=256, help="pixels a side")
+    parser.add_argument("--moments", type=int, default=len(MOMENTS), help=f"how many of {', '.join(MOMENTS)}")
     parser.add_argument("scenes", nargs="+", help="suite-task")
     options = parser.parse_args()
     if mujoco.__version__ != options.mujoco:
         sys.exit(f"{sys.executable} has mujoco {mujoco.__version__}; the images are to be those of {options.mujoco}")
     options.out.mkdir(parents=True, exist_ok=True)
-    wanted = about(options.episode, options.size)
+    wanted = about(options.episode, options.size, options.moments)
     for scene in options.scenes:
         path = options.out / f"{scene}.npz"
         if is_current(path, wanted):
             continue
         suite, task = scene.rsplit("-", 1)
-        found = record(suite, int(task), options.episode, options.size)
+        found = record(suite, int(task), options.episode, options.size, options.moments)
         part = path.with_suffix(".part.npz")
         found["about"] = np.array(json.dumps(wanted))
         np.savez_compressed(part, **found)  # type: ignore[arg-type]
