@@ -3,10 +3,10 @@
     python benchmarks/images.py --peer .venv-upstream/bin/python [--scenes libero_goal-0 ...] [--rays all]
 
 The peer's Python writes upstream's images and the states they show to a folder (``benchmarks/images_peer.py``, once);
-the same states, fixtures in the same places, are then shown by vecenv, and each image is compared. A scene's number
-is its worst image's: three moments (of rays two), two cameras. ``exact`` and ``fast`` are levels of detail in GL;
-``rays`` is ``engine="raytrace"``, slow on a CPU and by default run in one scene of each workspace; ``current`` is what
-the installed MuJoCo shows, for comparison.
+the same states, fixtures in the same places, are then shown by vecenv, and each image is compared. A scene's number is
+its worst image's: two cameras, the start and a state in motion; ``_shuffled`` is a third state, every hinge and slide
+somewhere else. ``exact`` and ``fast`` are levels of detail in GL; ``rays`` is ``engine="raytrace"``, slow on a CPU and
+by default run in one scene of each workspace; ``current`` is what the installed MuJoCo shows, for comparison.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ from vecenv.render.options import RenderConfig
 
 PUBLISHED = "3.3.0"
 REFERENCES = ROOT / "build" / "upstream_images"
-# Rays are not compared in the last one: they draw no sky, which is what an arm somewhere else may look at.
-RAY_MOMENTS = 2
+# Moments of a rollout, the first two. In the third the wrist camera looks anywhere: from below a table, at the sky. It
+# is there to find what MuJoCo changed, in every detail; what simplified meshes show then is reported and not promised.
+ROLLOUT = 2
 # What the project promises of every image, dB.
-ENOUGH = {"exact": 40.0, "fast": 32.0, "rays": 24.0}
+ENOUGH = {"exact": 40.0, "exact_shuffled": 40.0, "fast": 32.0, "rays": 24.0}
+COLUMNS = ("exact", "exact_shuffled", "fast", "fast_shuffled", "rays", "current")
 RENDER = {
     "exact": RenderConfig(lod="exact"),
     "fast": RenderConfig(lod="fast"),
@@ -60,19 +62,23 @@ def write_references(peer: Path, folder: Path, names: Sequence[str]) -> None:
 
 
 def row(name: str, workspace: str, reference: Reference, kinds: Sequence[str]) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        "scene": name,
-        "workspace": workspace.removeprefix("libero_").removesuffix("_manipulation"),
-    }
-    for kind in RENDER:
-        if kind in kinds:
-            moments = range(RAY_MOMENTS if kind == "rays" else len(MOMENTS))
-            seen = agreement(reference.drawn(RENDER[kind], moments), reference.images[moments])
-            found[kind] = round(float(seen.min()), 1)
-        else:
-            found[kind] = None
+    """The worst image of each kind: of the two moments of a rollout, and in GL of the third."""
+    short = workspace.removeprefix("libero_").removesuffix("_manipulation")
+    found: dict[str, Any] = {"scene": name, "workspace": short, **dict.fromkeys(COLUMNS)}
+    for kind in kinds:
+        moments = range(ROLLOUT if kind == "rays" else len(MOMENTS))
+        seen = agreement(reference.drawn(RENDER[kind], moments), reference.images[moments]).min(axis=1)
+        found[kind] = round(float(seen[:ROLLOUT].min()), 1)
+        if f"{kind}_shuffled" in found:
+            found[f"{kind}_shuffled"] = round(float(seen[ROLLOUT]), 1)
     print(found, flush=True)
     return found
+
+
+def kinds_of(name: str, traced: set[str]) -> list[str]:
+    """What is compared in a scene."""
+    own = name.rsplit("-", 1)[0] in suites.BASE_SUITES
+    return ["exact", "fast"] + ["current"] * own + ["rays"] * (name in traced)
 
 
 def first_of_each(workspaces: dict[str, str]) -> set[str]:
@@ -97,17 +103,17 @@ def main() -> None:
         parser.error(f"no scene {unknown[0]!r}; there are {', '.join(every)}")
     write_references(options.peer, options.references, names)
     traced = {"all": set(names), "none": set(), "workspaces": first_of_each({name: every[name] for name in names})}
-    rows = []
-    for name in names:
-        kinds = [kind for kind in RENDER if kind != "rays" or name in traced[options.rays]]
-        rows.append(row(name, every[name], Reference.load(options.references, name), kinds))
-    lowest = {
-        kind: min((each[kind], each["scene"]) for each in rows if each[kind] is not None)
-        for kind in RENDER
-        if any(each[kind] is not None for each in rows)
+    rows = [
+        row(name, every[name], Reference.load(options.references, name), kinds_of(name, traced[options.rays]))
+        for name in names
+    ]
+    found = {kind: [(each[kind], each["scene"]) for each in rows if each[kind] is not None] for kind in COLUMNS}
+    lowest = {kind: min(pairs) for kind, pairs in found.items() if pairs}
+    notes = {
+        "upstream_mujoco": PUBLISHED,
+        "unit": f"dB, a scene's worst image of {', '.join(MOMENTS[:ROLLOUT])}; *_shuffled: of {MOMENTS[ROLLOUT]}",
+        "lowest": lowest,
     }
-    moments = {"moments": MOMENTS, "ray_moments": MOMENTS[:RAY_MOMENTS]}
-    notes = {"upstream_mujoco": PUBLISHED, **moments, "unit": "dB, the scene's worst image", "lowest": lowest}
     report(options.out, rows, title=f"Images against upstream under MuJoCo {PUBLISHED}", notes=notes)
     if failed := {kind: lowest[kind] for kind in ENOUGH if kind in lowest and lowest[kind][0] < ENOUGH[kind]}:
         raise SystemExit(f"below what is promised: {failed}")

@@ -51,7 +51,7 @@ def enough() -> float:
     context = open_context(choose(), SIZE, SIZE)
     from OpenGL import GL  # after MuJoCo has said which GL it shall load
 
-    name = bytes(GL.glGetString(GL.GL_RENDERER))
+    name = GL.glGetString(GL.GL_RENDERER) or b""
     context.free()
     return SAME_DRIVER if b"llvmpipe" in name else ANY_DRIVER
 
