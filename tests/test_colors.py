@@ -22,7 +22,7 @@ from vecenv.libero.functional import FunctionalConfig, FunctionalError
 from vecenv.libero.sources import installed_tasks
 from vecenv.render import colors, eyes
 from vecenv.render.gl import choose, open_context
-from vecenv.render.options import RenderConfig, RenderError
+from vecenv.render.options import RenderConfig, RenderError, VisualOptions
 from vecenv.render.scenery import Scenery, installed_scenery
 
 FOLDER = Path(__file__).with_name("upstream_images")
@@ -90,6 +90,24 @@ def test_textures_of_boxes_lie_where_they_lay() -> None:
     both = [drawn(PLAIN, lod="original", colors=each) for each in ("published", "current")]
     published, current = (agreement(images, theirs) for images in both)
     assert (published > current + 2.0).all()
+
+
+@needs_gl
+def test_a_texture_that_walls_are_given_is_seen_on_them() -> None:
+    """Also one of the six sides of a cube, which no mesh can wear."""
+    suite, task, swapped, seen = "libero_10", 0, [], []
+    for asked in ("published", "current"):
+        env = vecenv.make(suite, task=task, episodes=[0], render=RenderConfig(height=SIZE, width=SIZE, colors=asked))
+        env.reset()
+        seen.append(env.observe_egocentric().images["agentview"])
+        env.set_visuals(VisualOptions(textures={"walls_mat": "tex-table"}))  # type: ignore[attr-defined]
+        swapped.append(env.observe_egocentric().images["agentview"])
+        env.set_visuals(VisualOptions())  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(env.observe_egocentric().images["agentview"], seen[-1])
+        env.close()
+    assert (seen[0] != seen[1]).any()
+    np.testing.assert_array_equal(*swapped)
+    assert np.abs(swapped[0].astype(int) - seen[0]).max() > 20
 
 
 @needs_gl

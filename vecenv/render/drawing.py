@@ -22,6 +22,7 @@ import numpy as np
 from vecenv.contract import CameraView
 from vecenv.libero import catalog
 from vecenv.libero.scene import Entity, Scene
+from vecenv.render.colors import SKIN
 from vecenv.render.options import (
     ALIASES,
     CameraShift,
@@ -110,6 +111,7 @@ class Stage:
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
         self._boxes, self._walls, self._mirrors = _Boxes(model), _Walls(model), _Mirrors(model)
         self._burners = _burners(model, scene)
+        self._skins = np.array([model.geom(geom).name.startswith(SKIN) for geom in range(model.ngeom)], bool)
         for site in range(model.nsite):
             if model.site(site).name.startswith(TOOL_SITES):
                 model.site_group[site] = _HIDDEN
@@ -250,7 +252,7 @@ class Stage:
             return
         model, head = self.model, self.model.vis.headlight
         touched = [model.light_diffuse, model.light_ambient, model.light_specular, model.mat_rgba, model.geom_rgba]
-        touched += [head.diffuse, head.ambient, head.specular, model.mat_texid]
+        touched += [head.diffuse, head.ambient, head.specular, model.mat_texid, self._groups]
         before = [array.copy() for array in touched]
         scale = options.light * np.asarray(options.light_color, float)
         for light in (*touched[:3], *touched[5:8]):
@@ -263,6 +265,8 @@ class Stage:
         for material, texture in options.textures.items():
             row = _id(model, mujoco.mjtObj.mjOBJ_MATERIAL, material)
             model.mat_texid[row, _RGB] = _id(model, mujoco.mjtObj.mjOBJ_TEXTURE, texture)
+            # Skins are for the texture that was there, and a cube's would not fit them.
+            self._groups[self._skins & (model.geom_matid == row)] = _HIDDEN
         try:
             yield
         finally:
