@@ -1,6 +1,6 @@
 """Images against upstream's own under the MuJoCo that LIBERO was published with: the table of docs/rendering.md.
 
-    python benchmarks/images.py --peer .venv-upstream/bin/python [--scenes libero_goal-0 ...] [--rays all]
+    python benchmarks/images.py [--peer .venv-upstream/bin/python] [--scenes libero_goal-0 ...] [--rays all]
 
 The peer's Python writes upstream's images and the states they show to a folder (``benchmarks/images_peer.py``, once);
 the same states, fixtures in the same places, are then shown by vecenv, and each image is compared. A scene's number is
@@ -53,8 +53,20 @@ def scenes() -> dict[str, str]:
     return dict(found.values())
 
 
+def add_peer(parser: argparse.ArgumentParser) -> None:
+    """The option that names the peer's Python."""
+    told = f"Python of an environment with mujoco {PUBLISHED} and LIBERO; that of `make upstream` by default"
+    parser.add_argument("--peer", type=Path, default=ROOT / ".venv-upstream" / "bin" / "python", help=told)
+
+
 def write_references(peer: Path, folder: Path, names: Sequence[str]) -> None:
-    """Have the peer write the files that are not there; the GL is the one that vecenv draws with."""
+    """Have the peer write the files that are not there; the GL is the one that vecenv draws with.
+
+    Raises:
+        SystemExit: there is no such Python.
+    """
+    if not peer.is_file():
+        raise SystemExit(f"{peer}: no such file; `make upstream` makes the environment, or name one with --peer")
     script = Path(__file__).with_name("images_peer.py")
     paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     command = [str(peer), str(script), "--out", str(folder), "--mujoco", PUBLISHED, *names]
@@ -91,7 +103,7 @@ def first_of_each(workspaces: dict[str, str]) -> set[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--peer", type=Path, required=True, help=f"Python of a venv with mujoco {PUBLISHED} and LIBERO")
+    add_peer(parser)
     parser.add_argument("--references", type=Path, default=REFERENCES, help="folder of upstream's images")
     parser.add_argument("--scenes", nargs="+", metavar="SUITE-TASK", help="which scenes; all of them by default")
     parser.add_argument("--rays", choices=("workspaces", "all", "none"), default="workspaces")

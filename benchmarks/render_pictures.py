@@ -1,6 +1,6 @@
 """Make ``docs/rendering/``: the same state as upstream draws it under MuJoCo 3.3.0, and as vecenv does.
 
-    python benchmarks/render_pictures.py --peer .venv-upstream/bin/python
+    python benchmarks/render_pictures.py [--peer .venv-upstream/bin/python]
 
 Each picture has upstream, ``lod="exact"``, ``lod="fast"`` and, with the colours of the installed MuJoCo, ``"current"``
 from left to right, the third-person camera above and the wrist camera below. Prints how alike they are: PSNR in dB and
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from common import ROOT
-from images import PUBLISHED, REFERENCES, RENDER, write_references
+from images import REFERENCES, RENDER, add_peer, write_references
 from pictures import Reference, agreement, ssim
 
 SCENES = ("libero_object-0", "libero_spatial-0", "libero_goal-0", "libero_10-0")
@@ -32,7 +32,7 @@ def write(path: Path, columns: list[np.ndarray]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--peer", type=Path, required=True, help=f"Python of a venv with mujoco {PUBLISHED} and LIBERO")
+    add_peer(parser)
     options = parser.parse_args()
     write_references(options.peer, REFERENCES, SCENES)
     for scene in SCENES:
