@@ -52,6 +52,7 @@ parity: $(VENV)/.installed-dev upstream ## Regenerate the tables of docs/fidelit
 	$(RUN)/python benchmarks/premises.py
 	$(RUN)/python benchmarks/premises.py --start raw
 	$(RUN)/python benchmarks/policy.py
+	$(RUN)/python benchmarks/images.py --peer $(VENV)-upstream/bin/python
 
 bench: $(VENV)/.installed-dev ## Regenerate the tables of docs/performance.md against upstream (about 40 minutes on 2 cores)
 	$(RUN)/vecenv bench physics --out benchmarks/results/physics.json

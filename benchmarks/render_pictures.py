@@ -1,57 +1,49 @@
-"""Make ``docs/rendering/``: the same state as upstream draws it, with ``lod="exact"`` and with ``lod="fast"``.
+"""Make ``docs/rendering/``: the same state as upstream draws it under MuJoCo 3.3.0, and as vecenv does.
 
-Each picture has upstream, exact and fast from left to right, the third-person camera above and the wrist camera below.
-Prints how alike they are: PSNR in dB and SSIM against upstream, the lower of the two cameras.
+    python benchmarks/render_pictures.py [--peer .venv-upstream/bin/python]
+
+Each picture has upstream, ``lod="exact"``, ``lod="fast"`` and, with the colours of the installed MuJoCo, ``"current"``
+from left to right, the third-person camera above and the wrist camera below. Prints how alike they are: PSNR in dB and
+SSIM against upstream, the lower of the two cameras.
 """
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from common import ROOT
-from pictures import psnr, ssim
-from test_render_parity import CAMERAS, fixtures_of, pair
+from images import REFERENCES, RENDER, add_peer, write_references
+from pictures import Reference, agreement, ssim
 
-import vecenv
-from vecenv.render.options import RenderConfig
-
-SCENES = (("libero_object", 0), ("libero_spatial", 0), ("libero_goal", 0), ("libero_10", 0))
+SCENES = ("libero_object-0", "libero_spatial-0", "libero_goal-0", "libero_10-0")
 FOLDER = ROOT / "docs" / "rendering"
+KINDS = ("exact", "fast", "current")
 
 
-def pictures(suite: str, task: int) -> dict[str, dict[str, np.ndarray]]:
-    """By side, then by camera: uint8 [256, 256, 3]. One upstream environment for both: it places fixtures at random."""
-    with pair(suite, task, 0) as (peer, theirs, exact):
-        options: Any = {"fixtures": fixtures_of(peer), "start": "raw", "settle_steps": 0}
-        fast = vecenv.make(suite, task=task, episodes=[0], render=RenderConfig(lod="fast"), **options)
-        fast.reset()
-        seen = {"exact": exact.observe_egocentric(), "fast": fast.observe_egocentric()}
-        found = {level: {name: egocentric.images[name][0] for name in CAMERAS} for level, egocentric in seen.items()}
-        fast.close()
-    return {"upstream": {name: theirs[key][::-1, ::-1] for name, key in CAMERAS.items()}, **found}
-
-
-def write(path: Path, found: dict[str, dict[str, np.ndarray]]) -> None:
-    """Three columns, two rows."""
+def write(path: Path, columns: list[np.ndarray]) -> None:
+    """Images of both cameras [2, H, W, 3] as columns."""
     from PIL import Image
 
-    columns = [np.concatenate([found[side][name] for name in CAMERAS]) for side in ("upstream", "exact", "fast")]
     path.parent.mkdir(exist_ok=True)
-    Image.fromarray(np.concatenate(columns, axis=1)).save(path, quality=85)
+    Image.fromarray(np.concatenate([np.concatenate(list(pair)) for pair in columns], axis=1)).save(path, quality=85)
 
 
 def main() -> None:
-    for suite, task in SCENES:
-        found = pictures(suite, task)
-        path = FOLDER / f"{suite}_{task}.jpg"
-        write(path, found)
-        for level in ("exact", "fast"):
-            pairs = [(found["upstream"][name], found[level][name]) for name in CAMERAS]
-            print(
-                f"{path.name} {level}: {min(psnr(*p) for p in pairs):.1f} dB, SSIM {min(ssim(*p) for p in pairs):.3f}"
-            )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_peer(parser)
+    options = parser.parse_args()
+    write_references(options.peer, REFERENCES, SCENES)
+    for scene in SCENES:
+        reference = Reference.load(REFERENCES, scene)
+        theirs = reference.images[0]
+        drawn = {kind: reference.drawn(RENDER[kind], [0])[0] for kind in KINDS}
+        path = FOLDER / f"{scene.replace('-', '_')}.jpg"
+        write(path, [theirs, *drawn.values()])
+        for kind, ours in drawn.items():
+            alike = min(ssim(a, b) for a, b in zip(ours, theirs, strict=True))
+            print(f"{path.name} {kind}: {agreement(ours, theirs).min():.1f} dB, SSIM {alike:.3f}", flush=True)
 
 
 if __name__ == "__main__":

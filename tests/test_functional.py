@@ -285,6 +285,7 @@ def test_derivatives_of_a_step_are_those_of_finite_differences() -> None:
         ({"iterations": (0, 4)}, "iterations"),
         ({"cone": "round"}, "elliptic, pyramidal"),
         ({"episode_length": 0}, "episode_length"),
+        ({"colors": "srgb"}, "published, current"),
     ],
 )
 def test_bad_options_are_named(options: dict[str, Any], message: str) -> None:

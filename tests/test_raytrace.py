@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from functools import cache
 from pathlib import Path
@@ -313,6 +314,19 @@ def test_functional_observations_have_the_views_that_playground_expects() -> Non
     rgb = look(rays, (state.data.xpos, state.data.xquat, state.data.qpos)).rgb
     for view in (0, 1):
         np.testing.assert_allclose(state.obs[f"pixels/view_{view}"], rgb[:, view] / 255, atol=1e-6)
+
+
+def test_functional_images_have_the_colours_that_are_asked_for(tmp_path: Path) -> None:
+    installed_scenery(vecenv.list_tasks("libero_spatial")[0].problem(), colors="current").save(tmp_path / "dark.npz")
+    config = FunctionalConfig(
+        impl="warp",
+        budget=Budget(contacts=500, rows=1500, pairs=1, candidates=500),
+        obs=("proprio", "pixels"),
+        scenery=str(tmp_path / "dark.npz"),
+    )
+    with pytest.raises(RenderError, match="made with colors='current' and colors='published' is asked for"):
+        LiberoEnv("libero_spatial", task=0, config=config)
+    LiberoEnv("libero_spatial", task=0, config=dataclasses.replace(config, colors="current"))
 
 
 # -- the batched environment -------------------------------------------------------------------------------------------

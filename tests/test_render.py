@@ -6,6 +6,7 @@ Most of it on a scene of a few boxes that compiles in a millisecond; `test_rende
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import os
 import threading
 from collections.abc import Iterator
@@ -193,6 +194,53 @@ def test_what_no_camera_sees_is_left_out_and_nothing_else(stage: Stage) -> None:
         whole.close()
 
 
+MIRRORED = """
+<mujoco>
+  <asset>
+    <material name="mirror" rgba="0.2 0.2 0.2 1" reflectance="0.8"/>
+    <mesh name="cube" vertex="-1 -1 -1 1 -1 -1 -1 1 -1 1 1 -1 -1 -1 1 1 -1 1 -1 1 1 1 1 1" scale="0.1 0.1 0.1"/>
+  </asset>
+  <worldbody>
+    <light pos="0 0 5" castshadow="false"/>
+    <camera name="agentview" pos="0 -1 1" xyaxes="1 0 0 0 0.7 0.7" fovy="40"/>
+    <geom name="plate" type="{kind}" size="{size}" pos="0 0 0.02" material="mirror" group="1"/>
+    <body name="box_1_main" pos="0 0.5 1.5">
+      <freejoint/>
+      <geom name="box_1_g0" type="mesh" mesh="cube" rgba="0.8 0.1 0.1 1" group="1"/>
+    </body>
+    <body name="ball_1_main" pos="-0.3 -0.2 5"><freejoint/><geom type="sphere" size="0.1" group="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(("kind", "size"), [("plane", "0.4 0.4 0.1"), ("plane", "0 0 0.1"), ("box", "0.4 0.4 0.02")])
+def test_a_mirror_shows_what_the_picture_does_not(kind: str, size: str) -> None:
+    scene = dataclasses.replace(
+        tiny_scene(), model=mujoco.MjModel.from_xml_string(MIRRORED.format(kind=kind, size=size))
+    )
+    stage, rng = Stage(scene), np.random.default_rng(1)
+    model = stage.model
+    shots = []
+    for place in [(0, 0.5, 1.5), (0, 3, 0.5), *rng.uniform((-1, -1, 0.2), (1, 2, 2.5), (30, 3))]:
+        qpos = model.qpos0.copy()
+        qpos[:3] = place
+        shots.append(Shot(0, Pose(qpos, model.body_pos.copy(), model.body_quat.copy())))
+    culled, whole = GlRenderer([stage], height=SIZE, width=SIZE), GlRenderer([stage], height=SIZE, width=SIZE)
+    try:
+        pictures = rgb(culled, *shots)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(stage, "_always", np.ones(model.ngeom, bool))
+            np.testing.assert_array_equal(rgb(whole, *shots), pictures)
+        with pytest.MonkeyPatch.context() as patch:
+            # The first is in the mirror only.
+            patch.setattr(stage._mirrors, "cones", lambda *_: iter(()))
+            assert (rgb(whole, shots[0]) != pictures[0]).any()
+    finally:
+        culled.close()
+        whole.close()
+
+
 def test_the_sky_is_left_out_only_where_the_floor_hides_it(stage: Stage) -> None:
     pose = shot(stage).pose
     down, level = (stage.view(name, pose, VisualOptions(), 0) for name in ("agentview", "side"))
@@ -251,7 +299,9 @@ def test_unknown_names_are_refused(renderer: GlRenderer, stage: Stage) -> None:
             renderer.render([shot(stage, options=options)], ["agentview"])
 
 
-@pytest.mark.parametrize("options", [{"height": 0}, {"width": 5000}, {"lod": "best"}, {"num_threads": 0}])
+@pytest.mark.parametrize(
+    "options", [{"height": 0}, {"width": 5000}, {"lod": "best"}, {"num_threads": 0}, {"colors": "dark"}]
+)
 def test_impossible_configurations_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(RenderError):
         RenderConfig(**options)

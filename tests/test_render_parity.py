@@ -1,7 +1,8 @@
 """Pictures are upstream's: the same state seen through the same cameras by LIBERO's ``OffScreenRenderEnv``.
 
 The peer renders with images switched on, in the GL that vecenv draws with; its observations, turned by 180 degrees as
-VLA evaluations turn them, are compared with what ``observe_egocentric`` delivers.
+VLA evaluations turn them, are compared with what ``observe_egocentric`` delivers. It runs on the installed MuJoCo, so
+these are its colours, ``"current"``; ``test_colors.py`` has those that LIBERO was published with.
 """
 
 from __future__ import annotations
@@ -27,30 +28,17 @@ CAMERAS = {"agentview": "agentview_image", "wrist": "robot0_eye_in_hand_image"}
 ENOUGH = {"exact": 45.0, "original": 60.0}
 
 
-def peer_with_images(path: Any) -> Any:
-    control_env, _ = upstream._classes()
-    with upstream.silence():
-        return control_env(
-            str(path), has_offscreen_renderer=True, use_camera_obs=True, camera_heights=256, camera_widths=256
-        )
-
-
-def fixtures_of(peer: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    model = upstream.model_of(peer)
-    bodies = {name: model.body(fixture.root_body) for name, fixture in peer.env.fixtures_dict.items()}
-    return {name: (body.pos.copy(), body.quat.copy()) for name, body in bodies.items()}
-
-
 @contextmanager
 def pair(suite: str, task: int, episode: int, level: str = "exact") -> Iterator[tuple[Any, dict[str, Any], LiberoEnv]]:
     """Upstream right after ``set_init_state``, its observation, and ours in the same start."""
     spec = vecenv.list_tasks(suite)[task]
-    peer = peer_with_images(spec.bddl_path)
+    peer = upstream.peer_with_images(spec.bddl_path)
     with upstream.silence():
         peer.reset()  # which hides what a new environment still shows: the gripper's frames
     seen = peer.set_init_state(spec.init_states()[episode])
-    options: Any = {"fixtures": fixtures_of(peer), "start": "raw", "settle_steps": 0}
-    env = vecenv.make(suite, task=task, episodes=[episode], render=RenderConfig(lod=level), **options)
+    options: Any = {"fixtures": upstream.fixtures_of(peer), "start": "raw", "settle_steps": 0}
+    render = RenderConfig(lod=level, colors="current")
+    env = vecenv.make(suite, task=task, episodes=[episode], render=render, **options)
     assert isinstance(env, LiberoEnv)
     env.reset()
     yield peer, seen, env
@@ -63,10 +51,6 @@ def agreement(ours: Egocentric, theirs: dict[str, Any]) -> float:
     return min(psnr(ours.images[name][0], theirs[key][::-1, ::-1]) for name, key in CAMERAS.items())
 
 
-def random_action(rng: np.random.Generator) -> np.ndarray:
-    return np.append(rng.uniform(-1, 1, 6), rng.choice([-1.0, 1.0]))
-
-
 @pytest.mark.parametrize("level", list(ENOUGH))
 def test_pictures_of_a_rollout_are_upstreams(level: str) -> None:
     """The start, and frames in motion: upstream samples them within the 24th of 25 substeps."""
@@ -74,7 +58,7 @@ def test_pictures_of_a_rollout_are_upstreams(level: str) -> None:
     with pair("libero_goal", 7, 2, level) as (peer, seen, env):
         assert agreement(env.observe_egocentric(), seen) > ENOUGH[level]
         for _ in range(3):
-            action = random_action(rng)
+            action = upstream.random_action(rng)
             theirs, *_ = peer.step(action)
             env.step_continuous(action[None])
             assert agreement(env.observe_egocentric(), theirs) > ENOUGH[level]
@@ -89,25 +73,14 @@ def test_pictures_of_every_scene_are_upstreams(scene_id: str) -> None:
     with pair(suite, int(task), episode=int(task) % 50) as (peer, seen, env):
         found = [agreement(env.observe_egocentric(), seen)]
         for _ in range(2):
-            for action in (random_action(rng) for _ in range(3)):
+            for action in (upstream.random_action(rng) for _ in range(3)):
                 theirs, *_ = peer.step(action)
                 env.step_continuous(action[None])
             found.append(agreement(env.observe_egocentric(), theirs))
-        qpos, qvel = _shuffled(env, rng)
+        qpos = upstream.shuffled(env.mj_model, env.state().qpos[0], rng)
+        qvel = np.zeros(env.mj_model.nv)
         theirs = peer.set_init_state(np.concatenate([[0.0], qpos, qvel]))
         env.set_state(qpos=qpos[None], qvel=qvel[None])
         found.append(agreement(env.observe_egocentric(), theirs))
         print(scene_id, [round(value, 1) for value in found])
         assert min(found) > ENOUGH["exact"]
-
-
-def _shuffled(env: LiberoEnv, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Hinges and slides anywhere within their limits (stoves on, drawers open), free things a little off."""
-    model, state = env.mj_model, env.state()
-    qpos, limited = state.qpos[0].copy(), model.jnt_limited.astype(bool)
-    addresses = model.jnt_qposadr
-    low, high = model.jnt_range[limited].T
-    qpos[addresses[limited]] = rng.uniform(low, high)
-    for address in addresses[model.jnt_type == 0]:
-        qpos[address : address + 3] += rng.uniform(-0.05, 0.05, 3)
-    return qpos, np.zeros_like(state.qvel[0])

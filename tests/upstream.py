@@ -75,6 +75,17 @@ def whole_peer(path: Path) -> Any:
         return control_env(str(path), has_offscreen_renderer=False, use_camera_obs=False)
 
 
+def peer_with_images(path: Path, size: int = 256) -> Any:
+    """A fresh upstream environment whose observations hold both cameras' images (upside down); call ``reset`` before
+    use, which hides what a new environment still shows: the gripper's frames.
+    """
+    control_env, _ = _classes()
+    with silence():
+        return control_env(
+            str(path), has_offscreen_renderer=True, use_camera_obs=True, camera_heights=size, camera_widths=size
+        )
+
+
 def bare_peer(path: Path) -> Any:
     """A fresh upstream environment of a task file without visual meshes (a tenth of a second)."""
     _, simulation = _classes()
@@ -125,6 +136,27 @@ def set_fixtures(peer: Any, bodies: Iterable[int], pos: np.ndarray, quat: np.nda
     """Stand fixtures elsewhere: body ids [F], positions [F, 3] in metres, wxyz [F, 4]; seen at the next `set_state`."""
     for body, where, turn in zip(bodies, pos, quat, strict=True):
         model_of(peer).body_pos[body], model_of(peer).body_quat[body] = where, turn
+
+
+def fixtures_of(peer: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Where the fixtures stand: by name, position [3] in metres and orientation wxyz [4]."""
+    bodies = {name: model_of(peer).body(fixture.root_body) for name, fixture in peer.env.fixtures_dict.items()}
+    return {name: (body.pos.copy(), body.quat.copy()) for name, body in bodies.items()}
+
+
+def random_action(rng: np.random.Generator) -> np.ndarray:
+    """An action [7] of a random direction, its gripper opening or closing."""
+    return np.append(rng.uniform(-1, 1, 6), rng.choice([-1.0, 1.0]))
+
+
+def shuffled(model: mujoco.MjModel, qpos: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A qpos [nq], hinges and slides anywhere within their limits (stoves on, drawers open), free things a bit off."""
+    qpos, limited = qpos.copy(), model.jnt_limited.astype(bool)
+    low, high = model.jnt_range[limited].T
+    qpos[model.jnt_qposadr[limited]] = rng.uniform(low, high)
+    for address in model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]:
+        qpos[address : address + 3] += rng.uniform(-0.05, 0.05, 3)
+    return qpos
 
 
 def set_state(peer: Any, qpos: np.ndarray, qvel: np.ndarray) -> None:

@@ -52,7 +52,7 @@ from vecenv.physics.base import Start as PhysicsStart
 from vecenv.physics.budgets import Budget
 from vecenv.physics.mapped import Sized
 from vecenv.physics.mjx import System, World, jit
-from vecenv.render.options import LARGEST_SIDE, POLICY_CAMERAS
+from vecenv.render.options import COLORS, LARGEST_SIDE, POLICY_CAMERAS
 from vecenv.render.raytrace import RayTracer
 from vecenv.render.scenery import Scenery, installed_scenery
 
@@ -96,6 +96,8 @@ class FunctionalConfig:
         image_size: height and width of the images, pixels.
         scenery: what there is to see, a file that ``vecenv.render.scenery.Scenery.save`` wrote; None compiles it from
             the installed packages.
+        colors: how textures look in images: ``"published"``, as in LIBERO's demonstrations, or ``"current"``, as the
+            installed MuJoCo shows them; see ``vecenv.render.options.RenderConfig``. A scenery file must have the same.
         reward: ``"sparse"``, 1 in the step that succeeds; or ``"shaped"``, that plus the change of the objective's
             potential.
         objective: ``"goal"``, ``"reach"`` or ``"lift"``; defined in ``vecenv.libero.objectives``.
@@ -120,6 +122,7 @@ class FunctionalConfig:
     obs: str | Sequence[str] = ("proprio", "objects")
     image_size: int = 64
     scenery: str | None = None
+    colors: str = "published"
     reward: str = "sparse"
     objective: str = "goal"
     target: str | None = None
@@ -135,6 +138,7 @@ class FunctionalConfig:
             "contacts": CONTACTS,
             "cone": tuple(CONES),
             "action": tuple(ACTIONS),
+            "colors": COLORS,
             "reward": REWARDS,
             "objective": OBJECTIVES,
             "placement": PLACEMENTS,
@@ -497,9 +501,9 @@ class LiberoEnv:
         )
 
     def _made_tracer(self, problem: Problem) -> RayTracer:
-        size, file = self.config.image_size, self.config.scenery
-        scenery = installed_scenery(problem) if file is None else Scenery.load(file)
-        scenery.check(self.scene.model)
+        size, file, colors = self.config.image_size, self.config.scenery, self.config.colors
+        scenery = installed_scenery(problem, colors=colors) if file is None else Scenery.load(file)
+        scenery.check(self.scene.model, colors)
         return RayTracer(scenery, height=size, width=size)
 
     def _observed(self, data: Data) -> Any:

@@ -8,7 +8,7 @@ hangs, where fixtures go). The physics model leaves everything out that neither 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -176,14 +176,20 @@ class SceneSource:
     regions: Mapping[str, RegionSite]
     origin: str
 
-    def compile(self) -> Scene:
+    def compile(self, edit: Callable[[mujoco.MjSpec], None] | None = None) -> Scene:
         """Let MuJoCo compile it.
+
+        Args:
+            edit: changes the parsed MJCF before.
 
         Raises:
             SceneError: MuJoCo refuses the model.
         """
         try:
-            model = mujoco.MjSpec.from_string(self.xml).compile()
+            spec = mujoco.MjSpec.from_string(self.xml)
+            if edit is not None:
+                edit(spec)
+            model = spec.compile()
         except ValueError as error:
             raise SceneError(f"{self.origin}: MuJoCo rejects the scene: {error}") from error
         return Scene(

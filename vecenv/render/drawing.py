@@ -22,6 +22,7 @@ import numpy as np
 from vecenv.contract import CameraView
 from vecenv.libero import catalog
 from vecenv.libero.scene import Entity, Scene
+from vecenv.render.colors import SKIN
 from vecenv.render.options import (
     ALIASES,
     CameraShift,
@@ -108,8 +109,9 @@ class Stage:
         # Only meshes are left out when they are out of sight. Other shapes have few triangles, and Mesa's software
         # driver sometimes smears a wall behind the camera into the picture: upstream's have that, so must these.
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
-        self._boxes, self._walls = _Boxes(model), _Walls(model)
+        self._boxes, self._walls, self._mirrors = _Boxes(model), _Walls(model), _Mirrors(model)
         self._burners = _burners(model, scene)
+        self._skins = np.array([model.geom(geom).name.startswith(SKIN) for geom in range(model.ngeom)], bool)
         for site in range(model.nsite):
             if model.site(site).name.startswith(TOOL_SITES):
                 model.site_group[site] = _HIDDEN
@@ -222,7 +224,7 @@ class Stage:
         model, data = self.model, self._data
         before = data.cam_xpos[0].copy(), data.cam_xmat[0].copy(), model.cam_fovy[0].copy()
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = view.pos, view.mat.ravel(), view.fovy
-        seen = self._boxes.in_sight(data, view, aspect, self.clip_planes[0])
+        seen = self._seen(view, aspect)
         model.geom_group[:] = np.where(seen | self._always, self._groups, _HIDDEN)
         # MuJoCo draws everything once more for each mirror, also for one that is out of the picture.
         model.mat_reflectance[:] = np.where(np.isin(np.arange(model.nmat), model.geom_matid[seen]), self._shine, 0)
@@ -235,6 +237,13 @@ class Stage:
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = before
         return view
 
+    def _seen(self, view: View, aspect: float) -> np.ndarray:
+        """Geoms that are in the picture, or in a mirror that is, bool [ngeom]."""
+        seen = self._boxes.in_sight(self._data, _Cone.of_picture(view, aspect, self.clip_planes[0]))
+        for cone in self._mirrors.cones(self._data, view, seen):
+            seen = seen | self._boxes.in_sight(self._data, cone)
+        return seen
+
     @contextmanager
     def _looking(self, options: VisualOptions) -> Iterator[None]:
         """The model and the posed data with the options' light, colours and textures."""
@@ -243,7 +252,7 @@ class Stage:
             return
         model, head = self.model, self.model.vis.headlight
         touched = [model.light_diffuse, model.light_ambient, model.light_specular, model.mat_rgba, model.geom_rgba]
-        touched += [head.diffuse, head.ambient, head.specular, model.mat_texid]
+        touched += [head.diffuse, head.ambient, head.specular, model.mat_texid, self._groups]
         before = [array.copy() for array in touched]
         scale = options.light * np.asarray(options.light_color, float)
         for light in (*touched[:3], *touched[5:8]):
@@ -256,6 +265,8 @@ class Stage:
         for material, texture in options.textures.items():
             row = _id(model, mujoco.mjtObj.mjOBJ_MATERIAL, material)
             model.mat_texid[row, _RGB] = _id(model, mujoco.mjtObj.mjOBJ_TEXTURE, texture)
+            # Skins are for the texture that was there, and a cube's would not fit them.
+            self._groups[self._skins & (model.geom_matid == row)] = _HIDDEN
         try:
             yield
         finally:
@@ -285,6 +296,20 @@ class Stage:
         return 0
 
 
+@dataclass(frozen=True)
+class _Cone:
+    """What is seen from somewhere: points p with ``sides @ (p - apex) <= bounds``; [S, 3], [3], [S], world frame."""
+
+    sides: np.ndarray
+    apex: np.ndarray
+    bounds: np.ndarray
+
+    @classmethod
+    def of_picture(cls, view: View, aspect: float, near: float) -> _Cone:
+        """What lies beyond the near plane of a camera and between the sides of its picture."""
+        return cls(_side_normals(view, aspect), view.pos, np.array([-near, 0.0, 0.0, 0.0, 0.0]))
+
+
 class _Boxes:
     """The bounding boxes of a model's geoms, for leaving out what a camera cannot see.
 
@@ -297,15 +322,41 @@ class _Boxes:
         # Planes reach to the horizon; MuJoCo gives them no radius.
         self._endless = model.geom_rbound == 0
 
-    def in_sight(self, data: mujoco.MjData, view: View, aspect: float, near: float) -> np.ndarray:
-        """Geoms whose box is not wholly outside one side of the picture or before the near plane, bool [ngeom]."""
+    def in_sight(self, data: mujoco.MjData, cone: _Cone) -> np.ndarray:
+        """Geoms whose box is not wholly outside one side of a cone, bool [ngeom]."""
         turn = data.geom_xmat.reshape(-1, 3, 3)
         center = data.geom_xpos + np.einsum("nij,nj->ni", turn, self._center)
-        sides = _side_normals(view, aspect)
-        reach = np.einsum("nk,snk->sn", self._half, np.abs(np.einsum("si,nij->snj", sides, turn)))
-        distance = sides @ (center - view.pos).T
-        bounds = np.array([-near, 0.0, 0.0, 0.0, 0.0])
-        return self._endless | (distance - reach <= bounds[:, None]).all(axis=0)
+        reach = np.einsum("nk,snk->sn", self._half, np.abs(np.einsum("si,nij->snj", cone.sides, turn)))
+        distance = cone.sides @ (center - cone.apex).T
+        return self._endless | (distance - reach <= cone.bounds[:, None]).all(axis=0)
+
+
+class _Mirrors:
+    """The reflecting planes and boxes of a model; MuJoCo reflects in the upper side of a box."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE))
+        shine = np.where(model.geom_matid >= 0, model.mat_reflectance[model.geom_matid], 0.0)
+        self._geoms = np.flatnonzero(flat & (shine > 0) & np.isin(model.geom_group, DRAWN_GROUPS))
+        self._half = model.geom_size[self._geoms].copy()
+        self._half[model.geom_type[self._geoms] == mujoco.mjtGeom.mjGEOM_PLANE, 2] = 0
+
+    def cones(self, data: mujoco.MjData, view: View, seen: np.ndarray) -> Iterator[_Cone]:
+        """What the mirrors among the seen geoms show: from the eye's mirror image, through the mirror's edges."""
+        for geom, half in zip(self._geoms, self._half, strict=True):
+            turn = data.geom_xmat[geom].reshape(3, 3)
+            normal, middle = turn[:, 2], data.geom_xpos[geom] + turn[:, 2] * half[2]
+            height = normal @ (view.pos - middle)
+            if not seen[geom] or height <= 0:
+                continue
+            apex = view.pos - 2 * height * normal
+            sides, bounds = [-normal], [-height]
+            if (half[:2] > 0).all():  # else it has no end
+                corners = middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half[:2] @ turn[:, :2].T
+                # Edges in turn around +z, seen from below it.
+                sides += list(np.cross(np.roll(corners, -1, axis=0) - apex, corners - apex))
+                bounds += [0.0] * 4
+            yield _Cone(np.array(sides), apex, np.array(bounds))
 
 
 class _Walls:

@@ -17,9 +17,8 @@ import mujoco
 
 from vecenv.contract import CameraView, Rendered
 from vecenv.libero.bddl import Problem
-from vecenv.libero.scene import compile_scene
 from vecenv.physics.base import Group
-from vecenv.render import lod
+from vecenv.render.colors import visual_scene
 from vecenv.render.drawing import ROBOT, Pose, Stage, camera_view
 from vecenv.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
 from vecenv.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
@@ -34,15 +33,14 @@ _kept: OrderedDict[tuple, Stage] = OrderedDict()
 _compiling = threading.Lock()
 
 
-def stage_of(problem: Problem, physics: mujoco.MjModel, level: str) -> Stage:
+def stage_of(problem: Problem, physics: mujoco.MjModel, level: str, colors: str) -> Stage:
     """The stage of a problem's scene, compiled (seconds) unless it is in use or was lately; errors of compile_scene."""
-    key = (problem.scene_key(), level)
+    key = (problem.scene_key(), level, colors)
     with _compiling:
         stage = _stages.get(key)
         if stage is None:
-            scene = compile_scene(problem, visual=True)
+            scene = visual_scene(problem, colors, level)
             mujoco.mj_clearCache(mujoco.mj_getCache())  # 0.37 GB of decoded files
-            lod.simplify(scene.model, level)
             stage = _stages[key] = Stage(scene)
         _kept[key] = stage
         _kept.move_to_end(key)
@@ -81,7 +79,7 @@ class Eyes:
         if self._closed:
             raise GlError("the environment is closed: pictures must be read before")
         pairs = zip(problems, models, strict=True)
-        self._stages = [stage_of(problem, model, self.config.lod) for problem, model in pairs]
+        self._stages = [stage_of(problem, model, self.config.lod, self.config.colors) for problem, model in pairs]
         return self._stages
 
     def renderer(self, stages: Sequence[Stage]) -> GlRenderer:

@@ -19,6 +19,7 @@ ALIASES: Mapping[str, str] = MappingProxyType({"wrist": "robot0_eye_in_hand"})
 POLICY_CAMERAS = ("agentview", "wrist")
 LODS = ("original", "exact", "fast")
 ENGINES = ("gl", "raytrace")
+COLORS = ("published", "current")
 # MuJoCo's framebuffer and most drivers end here.
 LARGEST_SIDE = 4096
 
@@ -175,6 +176,9 @@ class RenderConfig:
         engine: ``"gl"``, upstream's renderer; or ``"raytrace"``, MuJoCo Warp's, which needs no GL and is fast on NVIDIA
             GPUs; its pictures differ a little, and of visual options it swaps no textures and colours no materials.
         num_threads: rendering threads, each with a GL context; None for one a core.
+        colors: ``"published"``, textures as MuJoCo up to 3.3.2 shows them, under which LIBERO's demonstrations were
+            rendered and its checkpoints scored; or ``"current"``, as the installed MuJoCo shows them
+            (``vecenv.render.colors`` says what differs).
     """
 
     height: int = 256
@@ -184,6 +188,7 @@ class RenderConfig:
     gl: str | None = None
     engine: str = "gl"
     num_threads: int | None = None
+    colors: str = "published"
 
     def __post_init__(self) -> None:
         if not (1 <= self.height <= LARGEST_SIDE and 1 <= self.width <= LARGEST_SIDE):
@@ -192,11 +197,22 @@ class RenderConfig:
             raise RenderError(f"lod={self.lod!r}: expected one of {', '.join(LODS)}")
         if self.engine not in ENGINES:
             raise RenderError(f"engine={self.engine!r}: expected one of {', '.join(ENGINES)}")
+        check_colors(self.colors)
         if self.num_threads is not None and self.num_threads < 1:
             raise RenderError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
         names = [camera.name for camera in self.cameras]
         if len(set(names)) != len(names):
             raise RenderError(f"two cameras have the same name: {', '.join(names)}")
+
+
+def check_colors(colors: str) -> None:
+    """See that these are colours that there are.
+
+    Raises:
+        RenderError: they are not; the message names those that are.
+    """
+    if colors not in COLORS:
+        raise RenderError(f"colors={colors!r}: expected one of {', '.join(COLORS)}")
 
 
 def matrix_of(quat: np.ndarray) -> np.ndarray:

@@ -306,7 +306,7 @@ class RayRenderer:
         key = (problem.scene_key(), cameras, wanted)
         if key not in self._looks:
             tracer = RayTracer(
-                installed_scenery(problem, self._config.lod),
+                installed_scenery(problem, self._config.lod, self._config.colors),
                 height=self._config.height,
                 width=self._config.width,
                 cameras=[None if name in self._own else name for name in cameras],

@@ -15,6 +15,7 @@ Each difference from the visual model has a reason:
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import weakref
 from dataclasses import dataclass
@@ -28,10 +29,11 @@ from vecenv.libero import catalog
 from vecenv.libero.bddl import Problem
 from vecenv.libero.scene import Scene, compile_scene
 from vecenv.render import drawing, lod
-from vecenv.render.options import RenderError
+from vecenv.render.colors import set_decoding
+from vecenv.render.options import RenderError, check_colors
 
 # Of the files; counts up when what is in them changes.
-_VERSION = 2
+_VERSION = 3
 # Longest side of a texture, texels.
 TEXTURE_SIDE = 256
 # MuJoCo draws a geom in its material's colour while the geom's own is this.
@@ -70,19 +72,26 @@ class Scenery:
         instances: what segmentation images tell apart; "" (index 0) is everything else.
         instance_of_geom: index into ``instances`` of each geom, int16 [ngeom].
         burners: geoms that are not always seen.
+        colors: how textures look, see ``vecenv.render.colors``.
     """
 
     model: mujoco.MjModel
     instances: tuple[str, ...]
     instance_of_geom: np.ndarray
     burners: tuple[Burner, ...] = ()
+    colors: str = "published"
 
-    def check(self, physics: mujoco.MjModel) -> None:
-        """See that poses of a physics model fit.
+    def check(self, physics: mujoco.MjModel, colors: str | None = None) -> None:
+        """See that poses of a physics model fit, and that it has these colours, if any are asked for.
 
         Raises:
-            RenderError: it is not of the same scene.
+            RenderError: it is not of the same scene, or has others.
         """
+        if colors is not None and colors != self.colors:
+            raise RenderError(
+                f"the scenery was made with colors={self.colors!r} and colors={colors!r} is asked for; "
+                f"make it anew with installed_scenery(problem, colors={colors!r}), or ask for colors={self.colors!r}"
+            )
         names = [[model.body(body).name for body in range(model.nbody)] for model in (self.model, physics)]
         if names[0] != names[1]:
             raise RenderError("the scenery and the physics model are not of the same scene")
@@ -91,8 +100,8 @@ class Scenery:
         """Write to a file that this version of MuJoCo can read."""
         buffer = np.zeros(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, buffer)
-        about = {"version": _VERSION, "instances": self.instances, "burners": [vars(burner) for burner in self.burners]}
-        text = np.array(json.dumps(about))
+        about = {"version": _VERSION, "instances": self.instances, "colors": self.colors}
+        text = np.array(json.dumps({**about, "burners": [vars(burner) for burner in self.burners]}))
         np.savez_compressed(path, model=buffer, about=text, instance_of_geom=self.instance_of_geom)
 
     @classmethod
@@ -118,28 +127,42 @@ class Scenery:
             instances=tuple(about["instances"]),
             instance_of_geom=arrays["instance_of_geom"],
             burners=burners,
+            colors=str(about["colors"]),
         )
 
 
-def scenery_of(scene: Scene, *, level: str = "fast", texture_side: int = TEXTURE_SIDE, join: bool = True) -> Scenery:
+def scenery_of(
+    scene: Scene,
+    *,
+    level: str = "fast",
+    colors: str = "published",
+    texture_side: int = TEXTURE_SIDE,
+    join: bool = True,
+) -> Scenery:
     """The scenery of a scene.
 
     Args:
         scene: compiled with ``visual=True``; its meshes are simplified in place.
         level: of detail, see ``vecenv.render.lod``.
+        colors: how textures look, ``"published"`` or ``"current"``, see ``vecenv.render.colors``.
         texture_side: longest side of a texture, texels.
         join: whether to join the untextured meshes of a body.
+
+    Raises:
+        RenderError: ``colors`` is neither.
     """
+    set_decoding(scene.model, colors)
     lod.simplify(scene.model, level)
-    return _Flattening(scene, texture_side, join).result()
+    return dataclasses.replace(_Flattening(scene, texture_side, join).result(), colors=colors)
 
 
-def installed_scenery(problem: Problem, level: str = "fast") -> Scenery:
+def installed_scenery(problem: Problem, level: str = "fast", colors: str = "published") -> Scenery:
     """The scenery of a problem's scene, compiled from the installed packages (10 s); errors of ``compile_scene``."""
-    key = (problem.scene_key(), level)
+    check_colors(colors)
+    key = (problem.scene_key(), level, colors)
     scenery = _sceneries.get(key)
     if scenery is None:
-        scenery = _sceneries[key] = scenery_of(compile_scene(problem, visual=True), level=level)
+        scenery = _sceneries[key] = scenery_of(compile_scene(problem, visual=True), level=level, colors=colors)
     return scenery
 
 
