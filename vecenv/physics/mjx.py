@@ -30,7 +30,7 @@ from vecenv.controllers import kinematics, osc, waypoint
 from vecenv.controllers.rotations import quat_to_mat
 from vecenv.libero import cache, contacts, goals
 from vecenv.libero.scene import HOME_QPOS, Scene
-from vecenv.physics import budgets, newton
+from vecenv.physics import budgets, mjx_contacts, newton
 from vecenv.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Followed, Physics, Ran, Start, Watcher
 from vecenv.physics.spread import Spread, replicated
 
@@ -208,6 +208,7 @@ def build(
 
     Raises:
         MjxError: see ``resolve_impl``; or the integrator is another; or the arm does not come first.
+        MjxContactsError: the scene has published contacts, and this MJX cannot give them.
     """
     chosen = resolve_impl(impl)
     _remember_compilations()
@@ -220,7 +221,7 @@ def build(
     # Single precision never gets as close as published contacts ask of native physics.
     model.opt.tolerance, model.opt.ls_tolerance = (contacts.OPTIONS["current"][name] for name in _TOLERANCES)
     touching = _without_contact_sensors(model) if chosen == "jax" else None
-    put = mjx.put_model(model, impl=chosen)
+    put = mjx_contacts.put_model(model, impl=chosen)
     if chosen == "warp":
         put = put.replace(opt=put.opt.tree_replace({"_impl.warn_overflow": 0}))
     chain = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), kinematics.chain_from_model(scene.model))
