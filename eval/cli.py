@@ -100,6 +100,7 @@ def replay_command(
     suite: str | None = typer.Option(None, help="What the files demonstrate.", show_default="what they say"),
     task: int | None = typer.Option(None, min=0, help="Task of --suite.", show_default="what they say"),
     backend: str | None = typer.Option(None, help="Physics backend.", show_default="the one on record"),
+    contacts: str | None = typer.Option(None, help="published or current.", show_default="those on record"),
     num_envs: int = typer.Option(256, min=1, help="Most demonstrations that run at once."),
     num_threads: int | None = typer.Option(None, min=1, help="Threads of the physics.", show_default="the backend's"),
     out: Path | None = typer.Option(None, help="JSON file to write the outcomes to.", show_default="none"),
@@ -108,8 +109,11 @@ def replay_command(
     from rich.console import Console
 
     from eval.replay import ReplayConfig, ReplayError, find_files, read_files, replay
+    from vecenv.libero.contacts import CONTACTS
 
     _check_task(suite, task)
+    if contacts is not None and contacts not in CONTACTS:
+        fail(unknown("contacts", contacts, CONTACTS))
     if out and not out.absolute().parent.is_dir():
         fail(f"--out {out}: there is no folder {out.absolute().parent}")
     try:
@@ -117,7 +121,7 @@ def replay_command(
     except ReplayError as error:
         fail(str(error))
     console = Console()
-    config = ReplayConfig(backend=backend, num_envs=num_envs, num_threads=num_threads)
+    config = ReplayConfig(backend=backend, contacts=contacts, num_envs=num_envs, num_threads=num_threads)
     report = replay(demos, config, on_batch=lambda text: console.print(text, highlight=False))
     report = dataclasses.replace(report, problems=(*unreadable, *report.problems))
     _print_replay(console, report)

@@ -40,9 +40,11 @@ class ReplayConfig:
         backend: physics backend; None for the one on record, ``native`` where there is none.
         num_envs: most demonstrations that run at once.
         num_threads: threads of the physics, None for the backend's own choice.
+        contacts: ``"published"`` or ``"current"``; None for those on record, published where there are none.
     """
 
     backend: str | None = None
+    contacts: str | None = None
     num_envs: int = 256
     num_threads: int | None = None
 
@@ -260,8 +262,9 @@ def _make(demos: Sequence[Demo], config: ReplayConfig) -> Any:
     for demo in demos:
         episodes.setdefault(demo.task, []).append(demo.start.episode if isinstance(demo.start, MadeStart) else 0)
     options |= {"max_steps": max(map(len, demos)), "num_threads": config.num_threads}
-    if config.backend is not None:
-        options["backend"] = config.backend
+    for name in ("backend", "contacts"):
+        if getattr(config, name) is not None:
+            options[name] = getattr(config, name)
     env: Any = vecenv.make(demos[0].suite, tasks=list(episodes), episodes=episodes, **options)
     try:
         env.reset()

@@ -217,7 +217,7 @@ def test_a_missing_mesh_is_reported_as_it_is_without_a_cache(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lost = source_of(CUBE.format(file=tmp_path / "lost.obj"))
-    monkeypatch.setattr(cache, "scene_source", lambda problem, contact_pairs: lost)
+    monkeypatch.setattr(cache, "scene_source", lambda problem, **_: lost)
     with pytest.raises(SceneError, match=r"cube\.bddl: MuJoCo rejects the scene: .*lost\.obj"):
         cached_scene(PROBLEM)
 

@@ -24,7 +24,7 @@ from vecenv.libero.suites import TaskSpec
 def scene_of(scene_id: str) -> Scene:
     """The scene with the contact sensors of all its tasks, as an environment compiles it."""
     problems = [task.problem() for task in upstream.tasks_of(scene_id)]
-    return compile_scene(problems[0], contact_pairs=goals.contact_pairs(problems))
+    return compile_scene(problems[0], contact_pairs=goals.contact_pairs(problems), contacts="current")
 
 
 def distinct_goals(scene_id: str) -> list[TaskSpec]:
@@ -140,7 +140,7 @@ def test_contact_sensors_see_what_upstreams_contact_test_sees(scene_id: str) -> 
     task = upstream.tasks_of(scene_id)[0]
     names = list(scene_of(scene_id).entities)
     pairs = [(a, b) for i, a in enumerate(names) for b in names[:i]]
-    simulation = Simulation(compile_scene(task.problem(), contact_pairs=pairs))
+    simulation = Simulation(compile_scene(task.problem(), contact_pairs=pairs, contacts="current"))
     peer = upstream.peer_of(task.bddl_path)
     bodies, pos, quat = fixtures.poses(task.problem(), simulation.scene, "center", keys=[(0, "", 0, 0)], slots=[0])
     simulation.stand(list(bodies), pos[0], quat[0])
@@ -202,7 +202,7 @@ def test_resting_on_a_fixture_counts_and_a_millimetre_above_does_not(scene_id: s
     """Microwaves have a contact margin of 1 mm, so there contact begins before anything touches."""
     task, fixture = upstream.tasks_of(scene_id)[0], target.split("_1")[0] + "_1"
     problem = with_goal(task.problem(), Predicate("on", (name, target)))
-    simulation = Simulation(compile_scene(problem, contact_pairs=goals.contact_pairs([problem])))
+    simulation = Simulation(compile_scene(problem, contact_pairs=goals.contact_pairs([problem]), contacts="current"))
     peer = upstream.peer_of(upstream.tasks_of(scene_id)[0].bddl_path)
     bodies, pos, quat = fixtures.poses(problem, simulation.scene, "center", keys=[(0, "", 0, 0)], slots=[0])
     simulation.stand(list(bodies), pos[0], quat[0])
@@ -237,7 +237,7 @@ def verdicts_on(goal: tuple[Predicate, ...], heights: tuple[float, ...]) -> tupl
     """Ours and upstream's on a goal with the first object at some heights."""
     task = upstream.tasks_of("libero_90-6")[0]
     problem = with_goal(task.problem(), *goal)
-    simulation = Simulation(compile_scene(problem, contact_pairs=goals.contact_pairs([problem])))
+    simulation = Simulation(compile_scene(problem, contact_pairs=goals.contact_pairs([problem]), contacts="current"))
     states = []
     for height in heights:
         state = task.init_states()[0, 1 : 1 + simulation.model.nq].copy()

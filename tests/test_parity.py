@@ -1,10 +1,14 @@
 """Trajectories are upstream's: same start, fixtures and actions give the same states, observations and verdicts.
 
-The peer is LIBERO on robosuite 1.4.0 under the installed MuJoCo, without images.
+The peer of current contacts is LIBERO on robosuite 1.4.0 under the installed MuJoCo, without images. The peer of
+published contacts is the same under MuJoCo 3.3.0, whose rollouts are on record (``scripts/record_rollouts.py``).
 """
 
 from __future__ import annotations
 
+import functools
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +20,7 @@ from vecenv.libero.env import LiberoEnv
 from vecenv.libero.suites import task as task_spec
 
 SETTLE = 10
+RECORDED = Path(__file__).parent / "data" / "rollouts_mujoco_3_3_0.npz"
 # One task of each workspace, articulated fixtures and the densest contacts among them, and where fixtures are absent.
 TASKS = [
     ("libero_object", 0),
@@ -54,7 +59,8 @@ def pair(suite: str, task: int, episode: int) -> tuple[Any, LiberoEnv]:
     with upstream.silence():
         peer.reset()
     peer.set_init_state(spec.init_states()[episode])
-    env = vecenv.make(suite, task=task, episodes=[episode], fixtures=fixtures_of(peer), start="raw", settle_steps=0)
+    options = {"start": "raw", "settle_steps": 0, "contacts": "current"}
+    env = vecenv.make(suite, task=task, episodes=[episode], fixtures=fixtures_of(peer), **options)  # type: ignore[arg-type]
     assert isinstance(env, LiberoEnv)
     env.reset()
     return peer, env
@@ -91,3 +97,56 @@ def test_the_first_tick_starts_from_the_reset_pose() -> None:
     aimed_from = controller.goal_pos - 0.05 * action[:3]
     np.testing.assert_allclose(aimed_from, controller.initial_ee_pos, atol=1e-12)
     assert np.linalg.norm(aimed_from - start) > 0.004
+
+
+# -- published contacts ------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def recorded() -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
+    """Jobs, and arrays named by the number of the job."""
+    with np.load(RECORDED, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    return json.loads(str(arrays.pop("jobs"))), arrays
+
+
+def apart_from_record(number: int, contacts: str) -> tuple[np.ndarray, np.ndarray]:
+    """Largest difference of joint positions after each tick, [T], and whether the robot has touched anything, [T]."""
+    jobs, arrays = recorded()
+    job = jobs[number]
+    names, pos, quat, actions, qpos, touched, success = (
+        arrays[f"{number}/{name}"]
+        for name in ("fixtures", "fixture_pos", "fixture_quat", "actions", "qpos", "touched", "success")
+    )
+    env = vecenv.make(
+        job["suite"],
+        task=job["task"],
+        episodes=[job["episode"]],
+        fixtures={str(name): (pos[i], quat[i]) for i, name in enumerate(names)},
+        start="raw",
+        settle_steps=0,
+        contacts=contacts,
+    )
+    assert isinstance(env, LiberoEnv)
+    env.reset()
+    apart = []
+    for tick, action in enumerate(actions):
+        control = env.step_continuous(action[None])
+        apart.append(np.abs(env.state().qpos[0] - qpos[tick]).max())
+        assert bool(control.success[0]) == bool(success[tick])
+    env.close()
+    return np.array(apart), touched
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_published_contacts_give_the_rollouts_of_mujoco_3_3_0(number: int) -> None:
+    apart, touched = apart_from_record(number, "published")
+    assert apart[~touched].max(initial=0) <= 1e-5
+    assert apart[touched].max(initial=0) <= 1e-3
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_current_contacts_move_what_published_ones_leave_where_it_is(number: int) -> None:
+    """The bowl falls off its ramekin, and objects leave their places: what a wrong version of MuJoCo does to LIBERO."""
+    apart, _ = apart_from_record(number, "current")
+    assert apart.max() > 0.02

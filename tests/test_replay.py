@@ -115,7 +115,7 @@ def folder(tmp_path: Path, rollouts: dict[TaskSpec, list[Rollout]]) -> Path:
 def test_upstreams_rollouts_end_here_as_they_did_there(tmp_path: Path, rollouts: dict[TaskSpec, list[Rollout]]) -> None:
     for spec, some in rollouts.items():
         demo_files.write(tmp_path / f"{spec.name}.hdf5", spec, some)
-    report = run([tmp_path])
+    report = run([tmp_path], contacts="current")
     assert report.ok
     assert sorted((o.task, o.name, o.recorded) for o in report.outcomes) == [
         (task, f"demo_{i}", i == 2) for task in (1, 7) for i in range(3)
@@ -152,7 +152,7 @@ def test_without_an_mjcf_fixtures_are_at_their_centres_and_that_is_said(folder: 
 
 
 def test_the_command_prints_both_verdicts_and_exits_0_when_they_agree(folder: Path, tmp_path: Path) -> None:
-    result = invoke(folder, "--out", tmp_path / "out.json")
+    result = invoke(folder, "--contacts", "current", "--out", tmp_path / "out.json")
     assert result.exit_code == 0, result.output
     assert "batch 1/1: 6 demonstrations of up to 25 ticks" in result.stdout
     assert "verdicts agree: 6/6 (95 % interval 61.0%-100.0%)" in result.stdout

@@ -164,7 +164,7 @@ def test_upstreams_visual_geoms_change_nothing(scene_id: str) -> None:
     theirs = upstream.model_of(upstream.whole_peer(task.bddl_path))
     assert theirs.ngeom > len(colliding(theirs)) + 10
     assert_same_physics(task.problem(), scene_of(scene_id), theirs)
-    visual = compile_scene(task.problem(), visual=True)
+    visual = compile_scene(task.problem(), visual=True, contacts="current")
     assert_same_physics(task.problem(), visual, theirs)
     assert_looks_the_same(visual.model, theirs)
 

@@ -185,7 +185,9 @@ def _least_overlap(
     scale = 1 / jnp.sqrt(_safe(square, fine))
     across = across * scale[..., None]
     # Along the axis, axis a of the second box is as long as rot[i, b], where k, a and b are all different.
-    others = [turned[:, (k + 2) % 3] * size2[(k + 1) % 3] + turned[:, (k + 1) % 3] * size2[(k + 2) % 3] for k in range(3)]
+    others = [
+        turned[:, (k + 2) % 3] * size2[(k + 1) % 3] + turned[:, (k + 1) % 3] * size2[(k + 2) % 3] for k in range(3)
+    ]
     overlap = (size1 * jnp.abs(across)).sum(-1) + jnp.stack(others, 1) * scale
     overlap = overlap - jnp.abs((centre2 * across).sum(-1))
     apart = (faces < -margin).any() | (fine & (overlap < -margin)).any()

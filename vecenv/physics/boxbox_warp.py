@@ -393,9 +393,7 @@ def _edge_lines(found: candidates, quad: corners, flat_quad: corners, half: wp.v
 
 
 @wp.func
-def _edge_corners(
-    found: candidates, lines: int, quad: corners, flat_quad: corners, half: wp.vec3, margin: float
-):  # noqa: ANN202
+def _edge_corners(found: candidates, lines: int, quad: corners, flat_quad: corners, half: wp.vec3, margin: float):  # noqa: ANN202
     """The rectangle's corners inside the projected face, or beside it where no side crosses the rectangle."""
     longer = found
     count = int(lines)
@@ -430,7 +428,13 @@ def _edge_corners(
 
 @wp.func
 def _edge_vertices(
-    found: candidates, lines: int, have: int, quad: corners, flat_quad: corners, half: wp.vec3, rise: float,
+    found: candidates,
+    lines: int,
+    have: int,
+    quad: corners,
+    flat_quad: corners,
+    half: wp.vec3,
+    rise: float,
     margin: float,
 ):  # noqa: ANN202
     """The second box's corners above the rectangle, or near it where no side crosses the rectangle."""
