@@ -4,6 +4,7 @@ The same tasks are stepped from the same stored starts with the same random acti
 ``SubprocVectorEnv`` with a process a core, by vecenv, and by MuJoCo alone on vecenv's batch, without controller and
 verdicts. MuJoCo alone comes in two kinds: *bare* calls ``Batch.step`` 25 times a control step, which is what a
 controller that acts every substep needs; *fused* calls it once for all 25, which keeps each simulation in the cache.
+*current* is vecenv with the installed MuJoCo's contacts in the place of published ones.
 Each measurement is a process of its own, sides take turns, and medians of their rounds are compared, ratio first.
 """
 
@@ -86,13 +87,15 @@ def _upstream_vector_env(bddl_path: str, processes: int) -> Any:
 def measure_vecenv(suite: str, task: int, num_envs: int, threads: int, seconds: float) -> dict[str, float]:
     """Control steps a second of vecenv, and of MuJoCo alone on the same batch from the same states, bare and fused.
 
-    The three take turns tick by tick, MuJoCo with the controls that vecenv used last.
+    They take turns tick by tick, MuJoCo with the controls that vecenv used last. So does a second batch of vecenv with
+    current contacts, on a trajectory of its own.
     """
     from vecenv.libero.env import LiberoEnv
 
-    env = make_batch(suite, task, num_envs, threads)
+    env, current = (make_batch(suite, task, num_envs, threads, contacts) for contacts in ("published", "current"))
     assert isinstance(env, LiberoEnv)
     env.reset()
+    current.reset()
     group = env.physics.groups[0]
     alone = _bare_batch(group, threads)
 
@@ -101,11 +104,13 @@ def measure_vecenv(suite: str, task: int, num_envs: int, threads: int, seconds: 
             alone.step()
 
     for tick in range(10):
-        env.step_continuous(random_actions(num_envs, tick))
-    ticks, spent = 0, {"bare": 0.0, "fused": 0.0, "vecenv": 0.0}
-    while sum(spent.values()) < 3 * seconds:
+        for each in (env, current):
+            each.step_continuous(random_actions(num_envs, tick))
+    ticks, spent = 0, {"bare": 0.0, "fused": 0.0, "vecenv": 0.0, "current": 0.0}
+    while sum(spent.values()) < len(spent) * seconds:
         actions = random_actions(num_envs, ticks)
-        calls = (bare, lambda: alone.step(nstep=25), functools.partial(env.step_continuous, actions))
+        steps = (functools.partial(each.step_continuous, actions) for each in (env, current))
+        calls = (bare, lambda: alone.step(nstep=25), *steps)
         for name, call in zip(spent, calls, strict=True):
             alone.state[:] = group.state
             begin = time.perf_counter()
@@ -113,6 +118,7 @@ def measure_vecenv(suite: str, task: int, num_envs: int, threads: int, seconds: 
             spent[name] += time.perf_counter() - begin
         ticks += 1
     env.close()
+    current.close()
     return {name: ticks * num_envs / value for name, value in spent.items()}
 
 
@@ -127,7 +133,7 @@ def _bare_batch(group: Any, threads: int) -> Any:
     return bare
 
 
-def make_batch(suite: str, task: int, num_envs: int, threads: int | None) -> Any:
+def make_batch(suite: str, task: int, num_envs: int, threads: int | None, contacts: str = "published") -> Any:
     """A batch of exactly ``num_envs`` slots of one task; stored starts repeat beyond 50."""
     import vecenv
 
@@ -140,6 +146,7 @@ def make_batch(suite: str, task: int, num_envs: int, threads: int | None) -> Any
         settle_steps=0,
         max_steps=1_000_000,
         num_threads=threads,
+        contacts=contacts,
     )
 
 
@@ -164,7 +171,7 @@ def _worker(side: str, arguments: Mapping[str, Any]) -> dict[str, float]:
 
 def compare_scene(suite: str, task: int, *, rounds: int, seconds: float, num_envs: int, cores: int) -> dict[str, Any]:
     """One row: medians over rounds in which the sides take turns."""
-    found: dict[str, list[float]] = {"upstream": [], "vecenv": [], "bare": [], "fused": []}
+    found: dict[str, list[float]] = {"upstream": [], "vecenv": [], "bare": [], "fused": [], "current": []}
     for _ in range(rounds):
         sides = (
             _in_a_process("upstream", suite=suite, task=task, processes=cores, seconds=seconds),
@@ -176,13 +183,14 @@ def compare_scene(suite: str, task: int, *, rounds: int, seconds: float, num_env
     ratios = [ours / theirs for ours, theirs in zip(found["vecenv"], found["upstream"], strict=True)]
     shares = {
         kind: median(ours / alone for ours, alone in zip(found["vecenv"], found[kind], strict=True))
-        for kind in ("bare", "fused")
+        for kind in ("bare", "fused", "current")
     }
     return {
         "scene": f"{suite}/{task}",
         "vecenv / upstream": median(ratios),
         "vecenv / bare": shares["bare"],
         "vecenv / fused": shares["fused"],
+        "published / current contacts": shares["current"],
         "vecenv steps/s": round(median(found["vecenv"])),
         "upstream steps/s": round(median(found["upstream"])),
         "bare steps/s": round(median(found["bare"])),
