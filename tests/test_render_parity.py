@@ -2,7 +2,7 @@
 
 The peer renders with images switched on, in the GL that vecenv draws with; its observations, turned by 180 degrees as
 VLA evaluations turn them, are compared with what ``observe_egocentric`` delivers. It runs on the installed MuJoCo, so
-these are its colours, ``"current"``; ``test_colors.py`` has those that LIBERO was published with.
+these are its contacts and colours, ``"current"``; ``test_colors.py`` has those that LIBERO was published with.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def pair(suite: str, task: int, episode: int, level: str = "exact") -> Iterator[
     with upstream.silence():
         peer.reset()  # which hides what a new environment still shows: the gripper's frames
     seen = peer.set_init_state(spec.init_states()[episode])
-    options: Any = {"fixtures": upstream.fixtures_of(peer), "start": "raw", "settle_steps": 0}
+    options: Any = {"fixtures": upstream.fixtures_of(peer), "start": "raw", "settle_steps": 0, "contacts": "current"}
     render = RenderConfig(lod=level, colors="current")
     env = vecenv.make(suite, task=task, episodes=[episode], render=render, **options)
     assert isinstance(env, LiberoEnv)

@@ -99,8 +99,8 @@ def make(
         settle_steps: LIBERO, for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
         num_devices: LIBERO. Devices that MJX spreads the slots over.
         budget: LIBERO. Contact and constraint memory on MJX; None measures each scene once and remembers it.
-        render: LIBERO. Size and level of detail of camera images, cameras of one's own; 256 x 256 and upstream's
-            picture by default. Nothing is rendered that is not read.
+        render: LIBERO. Size, level of detail and colours of camera images, cameras of one's own; 256 x 256 and
+            upstream's picture as LIBERO was published with by default. Nothing is rendered that is not read.
         scenes: LIBERO. A folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and
             no LIBERO or robosuite files are needed. Otherwise from the installed packages.
         gripper: SIMPLER. ``"native"``: the robot's own convention, WidowX +1 open and -1 closed, Google Robot +1 closes
