@@ -82,6 +82,31 @@ def test_list_names_suites_and_their_tasks() -> None:
     assert "alphabet soup" in invoke("list", "libero_object").stdout
 
 
+def test_list_names_protocols_with_their_sources() -> None:
+    found = {
+        (each["family"], each["name"]): each for each in json.loads(invoke("list", "--protocols", "--json").stdout)
+    }
+    assert found["libero", "openpi"]["horizon"]["libero_10"] == 520
+    assert found["simpler", "visual-matching"]["success"] == "final"
+    printed = invoke("list", "--protocols").stdout
+    assert "220/280/300/520/400" in printed
+    for (_, name), each in found.items():
+        assert name in printed
+        assert all(source in printed for source in each["sources"])
+    of_suite = json.loads(invoke("list", "simpler/bridge", "--protocols", "--json").stdout)
+    assert {each["family"] for each in of_suite} == {"simpler"}
+    wrong = invoke("list", "libero", "--protocols")
+    assert (wrong.exit_code, "unknown suite 'libero'" in wrong.stderr) == (2, True)
+
+
+def test_a_protocol_that_a_suite_does_not_have_is_refused_before_a_folder_is_made(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    done = invoke("eval", "--suite", "libero_goal", "--protocol", "visual-matching", "--out", str(out))
+    assert done.exit_code == 2
+    assert "is not available for libero; available: seed, openvla, openvla-oft, openpi" in done.stderr
+    assert not out.exists()
+
+
 def test_missing_assets_are_one_line_with_the_way_to_get_them(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", "import sys; sys.argv = ['vecenv', 'list']; import vecenv.cli; vecenv.cli.main()"],

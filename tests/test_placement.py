@@ -60,6 +60,15 @@ def test_all_episodes_are_those_of_the_protocol_while_others_may_be_named() -> N
     assert episode_indices("12", 50, every=10) == tuple(range(12))
 
 
+def test_tasks_may_have_different_numbers_of_episodes() -> None:
+    counts = {0: 2, 2: 3}
+    assert pairs(cross([0, 2], "all", num_tasks=3, num_episodes=counts)) == [(0, 0), (0, 1), (2, 0), (2, 1), (2, 2)]
+    with pytest.raises(PlacementError, match=r"episode 2 does not exist; there are 2"):
+        cross([0, 2], [2], num_tasks=3, num_episodes=counts)
+    with pytest.raises(PlacementError, match="no slot to fill"):
+        cross([1], "all", num_tasks=3, num_episodes=counts)
+
+
 def test_a_whole_suite_is_five_hundred_slots() -> None:
     placement = cross(range(10), range(50), **SIZES)
     assert len(placement) == 500

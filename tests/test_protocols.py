@@ -180,6 +180,38 @@ def test_an_evaluation_plans_the_protocols_episodes() -> None:
     assert [e.episode for e in Evaluation(more).planned] == [49, 2]
 
 
+@pytest.mark.parametrize(
+    ("suite", "name", "tasks", "count"),
+    [
+        ("simpler/bridge", "visual-matching", "all", 4 * 24),
+        ("simpler/google_robot", "visual-matching", "pick_coke_can", 4 * 3 * 25),
+        ("simpler/google_robot", "visual-matching", "move_near_v0", 4 * 60),
+        ("simpler/google_robot", "visual-matching", "google_robot_open_drawer, google_robot_close_drawer", 2 * 108),
+        ("simpler/google_robot", "visual-matching", "place_apple", 4 * 3 * 9),
+        ("simpler/google_robot", "variant-aggregation", "pick_coke_can", 11 * 3 * 25),
+        ("simpler/google_robot", "seed", "0,3", 2 * 50),
+    ],
+)
+def test_simplers_tasks_have_as_many_episodes_as_their_protocol(suite: str, name: str, tasks: str, count: int) -> None:
+    evaluation = Evaluation(EvalConfig(suite=suite, protocol=name, policy="zero", tasks=tasks))
+    assert len(evaluation.planned) == sum(map(len, evaluation.batches())) == count
+
+
+def test_simplers_metadata_counts_task_by_task_and_leaves_out_what_a_protocol_does_not_have() -> None:
+    found = vecenv.eval_metadata("simpler/google_robot", protocol="variant-aggregation")
+    per_task = dict(zip(found["instructions"], found["episodes_per_task"], strict=True))
+    assert len(found["episodes_per_task"]) == found["num_tasks"] == len(found["max_steps"]) == 21
+    assert sum(found["episodes_per_task"]) == found["num_episodes"]
+    assert 0 in per_task.values()
+    everything = EvalConfig(suite="simpler/google_robot", protocol="variant-aggregation", policy="zero")
+    assert len(Evaluation(everything).planned) == found["num_episodes"]
+    without = found["episodes_per_task"].index(0)
+    with pytest.raises(ConfigError, match=f"has no episodes of task {without} of simpler/google_robot"):
+        Evaluation(dataclasses.replace(everything, tasks=str(without)))
+    with pytest.raises(ConfigError, match="no episodes of simpler/bridge"):
+        Evaluation(dataclasses.replace(everything, suite="simpler/bridge"))
+
+
 def test_recordings_hold_the_options_that_a_protocol_stands_for() -> None:
     options = make_options(vecenv.make, suite="libero_spatial", protocol="openpi", max_steps=7)
     assert options["reset_loop"] == dataclasses.asdict(ResetLoop())

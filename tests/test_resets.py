@@ -114,6 +114,17 @@ def test_a_batch_puts_each_episodes_fixtures_where_openpis_loop_does(suite: str)
     env.close()
 
 
+def test_starts_settle_with_upstreams_fixtures_too() -> None:
+    env = vecenv.make("libero_goal", task="bowl_on_the_plate", episodes=[0], fixtures="upstream", num_threads=1)
+    task = int(env.reset().task_id[0])
+    (snapshot,) = env.observe_objects().snapshot
+    (placed,) = placed_at(*scene_of("libero_goal", task), [ONCE.at(0, task, 0)])
+    assert snapshot is not None
+    for name in placements(*scene_of("libero_goal", task)):
+        np.testing.assert_allclose(snapshot.poses[name][:3], placed[name][0], rtol=0, atol=1e-9)
+    env.close()
+
+
 # -- against upstream --------------------------------------------------------------------------------------------------
 
 

@@ -132,13 +132,16 @@ def task_indices(tasks: Any, names: Sequence[str]) -> tuple[int, ...]:
     return tuple(chosen)
 
 
-def cross(tasks: Any, episodes: Any, *, num_tasks: int, num_episodes: int, every: int | None = None) -> Placement:
+def cross(
+    tasks: Any, episodes: Any, *, num_tasks: int, num_episodes: int | Mapping[int, int], every: int | None = None
+) -> Placement:
     """Every episode of every task, task by task.
 
     Args:
         tasks: one index or several.
         episodes: for all tasks, as for ``episode_indices``; or a mapping task -> such.
-        num_tasks, num_episodes: how many there are.
+        num_tasks: how many there are.
+        num_episodes: how many there are of every task, or task by task; tasks left out have none.
         every: how many episodes ``"all"`` are, where a protocol has fewer.
 
     Raises:
@@ -149,7 +152,8 @@ def cross(tasks: Any, episodes: Any, *, num_tasks: int, num_episodes: int, every
     pairs: list[tuple[int, int]] = []
     for task in task_list:
         spec = episodes.get(task, ()) if isinstance(episodes, Mapping) else episodes
-        pairs += [(task, episode) for episode in episode_indices(spec, num_episodes, every)]
+        there = num_episodes.get(task, 0) if isinstance(num_episodes, Mapping) else num_episodes
+        pairs += [(task, episode) for episode in episode_indices(spec, there, every)]
     if not pairs:
         raise PlacementError("no slot to fill: tasks or episodes are empty")
     columns = np.array(pairs)

@@ -466,7 +466,7 @@ def make_vec(
     Args:
         suite, task: which task.
         num_envs: how many; they begin with the first, second, ... of the episodes.
-        episodes: the init states each goes through; None for all 50.
+        episodes: the init states each goes through, as for ``vecenv.make``; None for all 50.
         obs, autoreset_mode: see ``VectorEnv``.
         options: as for ``vecenv.make``.
 
