@@ -220,10 +220,17 @@ def _print_rows(rows: list[dict[str, Any]]) -> None:
 
 def _print_protocols(chosen: Sequence[Protocol]) -> None:
     """A table of what protocols fix, then each one's source and what else is to be known."""
+    from rich import box
     from rich.console import Console
+    from rich.table import Table
 
-    _print_rows([_protocol_row(each) for each in chosen])
-    console = Console()
+    rows, console = [_protocol_row(each) for each in chosen], Console()
+    table = Table(*rows[0], box=box.SIMPLE, pad_edge=False)
+    for row in rows:
+        table.add_row(*map(str, row.values()))
+    # A narrow screen breaks lines; cut numbers would be of no use.
+    natural = Console(width=1000).measure(table).maximum
+    Console(width=max(console.width, natural)).print(table)
     for each in chosen:
         said = "; ".join(map(str, each.sources)) + (f". {each.note}" if each.note else "")
         console.print(f"{each.family} {each.name}: {said}", markup=False, highlight=False, soft_wrap=True)
