@@ -19,7 +19,7 @@ from typing import TypeAlias
 import mujoco
 import numpy as np
 
-from vecenv.libero import catalog
+from vecenv.libero import catalog, contacts
 from vecenv.libero import primitives as fits
 from vecenv.libero.bddl import Predicate, Problem
 from vecenv.libero.primitives import Solid
@@ -277,6 +277,7 @@ class _Rebuild:
             model = self.spec.compile()
         except ValueError as error:
             raise SceneError(f"{self.source.origin}: MuJoCo rejects the lean scene: {error}") from error
+        contacts.remark(model)
         entities = {
             name: replace(entity, contact_geoms=tuple(self.made.get(name, ())))
             for name, entity in self.exact.entities.items()

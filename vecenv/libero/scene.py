@@ -192,6 +192,7 @@ class SceneSource:
             model = spec.compile()
         except ValueError as error:
             raise SceneError(f"{self.origin}: MuJoCo rejects the scene: {error}") from error
+        contacts.remark(model)
         return Scene(
             problem_name=self.problem_name, model=model, arena=self.arena, entities=self.entities, regions=self.regions
         )
@@ -408,17 +409,12 @@ def _vec3(text: str) -> tuple[float, float, float]:
 
 
 def _choose_contacts(root: ET.Element, chosen: Contacts) -> None:
-    """Write the choice of contacts into an MJCF tree; errors of ``contacts.checked``."""
+    """Write the mark of chosen contacts into an MJCF tree; errors of ``contacts.checked``."""
     if contacts.checked(chosen) == "current":
         return
     numeric = root.find(f"custom/numeric[@name='{contacts.NUMERIC}']")
-    option = root.find("option")
     assert numeric is not None
-    assert option is not None
     numeric.set("data", repr(contacts.MARK))
-    for name, value in contacts.OPTIONS[chosen].items():
-        option.set(name, repr(value))
-    ET.SubElement(option, "flag", {"multiccd": "disable"})
 
 
 def _base() -> ET.Element:
