@@ -56,7 +56,7 @@ class _Found(NamedTuple):
 
 
 def collider(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A collision function of MJX: distances [8 N], positions [8 N, 3] and frames [8 N, 3, 3] of pairs of geoms [N, 2]."""
+    """A collision function of MJX: distances [8 N], positions [8 N, 3], frames [8 N, 3, 3] of pairs of geoms [N, 2]."""
     first, second = (Box(data.geom_xpos[g], data.geom_xmat[g], model.geom_size[g]) for g in geom.T)
     margin = model.geom_margin[geom].sum(-1)
     dist, pos, normal = jax.vmap(box_box)(first, second, margin)
@@ -185,7 +185,9 @@ def _least_overlap(
     scale = 1 / jnp.sqrt(_safe(square, fine))
     across = across * scale[..., None]
     # Along the axis, axis a of the second box is as long as rot[i, b], where k, a and b are all different.
-    others = [turned[:, (k + 2) % 3] * size2[(k + 1) % 3] + turned[:, (k + 1) % 3] * size2[(k + 2) % 3] for k in range(3)]
+    others = [
+        turned[:, (k + 2) % 3] * size2[(k + 1) % 3] + turned[:, (k + 1) % 3] * size2[(k + 2) % 3] for k in range(3)
+    ]
     overlap = (size1 * jnp.abs(across)).sum(-1) + jnp.stack(others, 1) * scale
     overlap = overlap - jnp.abs((centre2 * across).sum(-1))
     apart = (faces < -margin).any() | (fine & (overlap < -margin)).any()
