@@ -26,6 +26,7 @@ from jax import lax
 from mujoco import mjx
 
 import vecenv
+from vecenv.libero.contacts import CONTACTS
 from vecenv.libero.env import LiberoEnv
 from vecenv.physics.base import SUBSTEPS
 from vecenv.physics.mjx import MjxGroup, World, control_step, jit
@@ -39,17 +40,16 @@ def main() -> None:
     """Measure what the command line asks for."""
     options = arguments()
     rows: list[dict[str, Any]] = []
-    cases = itertools.product(options.scene, options.geometry, options.batch)
-    for scene, geometry, batch in cases:
+    cases = itertools.product(options.scene, options.geometry, options.batch, options.contacts)
+    for scene, geometry, batch, contacts in cases:
+        case = {"scene": scene, "geometry": geometry, "contacts": contacts, "B": batch}
         try:
-            rows.append(measure(scene, geometry, batch, options))
+            rows.append(case | measure(scene, geometry, batch, contacts, options))
         except Exception as error:
             if not any(sign in str(error).lower() for sign in OUT_OF_MEMORY):
                 raise
-            rows.append(
-                {**dict.fromkeys(rows[0] if rows else (), "-"), "scene": scene, "geometry": geometry, "B": batch}
-            )
-            print(f"{scene} {geometry} B={batch}: out of memory", flush=True)
+            rows.append(dict.fromkeys(rows[0] if rows else (), "-") | case)
+            print(f"{scene} {geometry} {contacts} B={batch}: out of memory", flush=True)
         print(rows[-1], flush=True)
     report(options.name, rows, title="MJX: control steps a second", notes={"device": str(jax.devices()[0])})
 
@@ -59,6 +59,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--scene", nargs="+", default=["libero_object/0", "libero_spatial/0"], help="suite/task")
     parser.add_argument("--geometry", nargs="+", default=["exact", "lean"])
+    parser.add_argument("--contacts", nargs="+", default=["published"], choices=CONTACTS, help="see `vecenv.make`")
     parser.add_argument("--backend", default="mjx")
     parser.add_argument("--batch", nargs="+", type=int, default=[64])
     parser.add_argument("--devices", type=int, default=1)
@@ -69,17 +70,17 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def measure(scene: str, geometry: str, batch: int, options: argparse.Namespace) -> dict[str, Any]:
-    """One row."""
+def measure(scene: str, geometry: str, batch: int, contacts: str, options: argparse.Namespace) -> dict[str, Any]:
+    """What is measured in one case."""
     before = used_memory()
     start = time.perf_counter()
-    env = ready_env(scene, geometry, batch, options.devices, options)
+    env = ready_env(scene, geometry, batch, contacts, options.devices, options)
     ready = time.perf_counter() - start
     group: MjxGroup = env.physics.groups[0]
     ours, compile_seconds = timed_first(environment(group))
     memory = used_memory() - before
     if options.devices > 1:
-        return compare_devices(ours, env, scene, geometry, batch, options) | {
+        return compare_devices(ours, env, scene, geometry, batch, contacts, options) | {
             "ready s": round(ready, 1),
             "compile s": round(compile_seconds, 1),
         }
@@ -89,13 +90,10 @@ def measure(scene: str, geometry: str, batch: int, options: argparse.Namespace) 
     rates = alternate([ours, theirs], options.rounds, options.seconds)
     failed = int((np.asarray(group.worlds.fault) != 0).sum())
     row = {
-        "scene": scene,
-        "geometry": geometry,
         "impl": group.built.impl,
         "geoms": int(
             (np.asarray(group.scene.model.geom_contype) | np.asarray(group.scene.model.geom_conaffinity) > 0).sum()
         ),
-        "B": batch,
         "env / bare": round(rates[0] / rates[1], 3),
         "env steps/s": round(rates[0] * batch * CHUNK),
         "bare steps/s": round(rates[1] * batch * CHUNK),
@@ -108,7 +106,9 @@ def measure(scene: str, geometry: str, batch: int, options: argparse.Namespace) 
     return row
 
 
-def ready_env(scene: str, geometry: str, batch: int, devices: int, options: argparse.Namespace) -> LiberoEnv:
+def ready_env(
+    scene: str, geometry: str, batch: int, contacts: str, devices: int, options: argparse.Namespace
+) -> LiberoEnv:
     """A batch at its starts."""
     suite, task = scene.rsplit("/", 1)
     env = vecenv.make(
@@ -117,6 +117,7 @@ def ready_env(scene: str, geometry: str, batch: int, devices: int, options: argp
         episodes=[i % 50 for i in range(batch)],
         backend=options.backend,
         geometry=geometry,
+        contacts=contacts,
         num_devices=devices,
         scenes=options.scenes,
     )
@@ -126,20 +127,23 @@ def ready_env(scene: str, geometry: str, batch: int, devices: int, options: argp
 
 
 def compare_devices(
-    ours: Callable[[], Any], env: LiberoEnv, scene: str, geometry: str, batch: int, options: argparse.Namespace
+    ours: Callable[[], Any],
+    env: LiberoEnv,
+    scene: str,
+    geometry: str,
+    batch: int,
+    contacts: str,
+    options: argparse.Namespace,
 ) -> dict[str, Any]:
-    """A row: the batch over several devices against its share on one."""
+    """The batch over several devices against its share on one."""
     share = batch // options.devices
-    single = ready_env(scene, geometry, share, 1, options)
+    single = ready_env(scene, geometry, share, contacts, 1, options)
     alone, _ = timed_first(environment(single.physics.groups[0]))
     rates = alternate([ours, alone], options.rounds, options.seconds)
     failed = sum(int((np.asarray(e.physics.groups[0].worlds.fault) != 0).sum()) for e in (env, single))
     for each in (env, single):
         each.close()
     return {
-        "scene": scene,
-        "geometry": geometry,
-        "B": batch,
         "devices": options.devices,
         "all / one": round(rates[0] * batch / (rates[1] * share), 3),
         "env steps/s": round(rates[0] * batch * CHUNK),

@@ -42,6 +42,7 @@ import numpy as np
 from common import RESULTS, ROOT
 
 import vecenv
+from vecenv.libero.contacts import CONTACTS, Contacts
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv
 from vecenv.libero.export import exported_tasks
 from vecenv.libero.scene import Scene
@@ -60,6 +61,8 @@ SAME_START = 1e-5
 NUDGE = 1e-7
 DOC = ROOT / "docs" / "mjx_fidelity_table.md"
 NAME = "mjx_fidelity"
+# Contacts of recordings and rows from before there was a choice.
+EARLIER = "current"
 
 Row: TypeAlias = dict[str, Any]
 
@@ -278,7 +281,8 @@ def record(options: argparse.Namespace) -> None:
 
 def record_scene(suite: str, tasks: Sequence[int], episodes: int, options: argparse.Namespace) -> Recording:
     """Idle and played episodes of one scene on the native backend."""
-    env = make(suite, tasks=tasks, episodes=range(episodes), max_steps=options.cap, scenes=options.scenes)
+    options_of_scene = {"max_steps": options.cap, "scenes": options.scenes, "contacts": options.contacts}
+    env = make(suite, tasks=tasks, episodes=range(episodes), **options_of_scene)
     b = env.num_envs
     start = ended(env, np.zeros(b, int), np.zeros(b, bool)).objects
     settled = run(env, np.tile(SETTLE_ACTION, (b, IDLE_TICKS, 1)), np.full(b, IDLE_TICKS)).objects
@@ -299,7 +303,7 @@ def record_scene(suite: str, tasks: Sequence[int], episodes: int, options: argpa
         start=start,
         settled=settled,
         end=end.objects,
-        notes={"policy": "pick_place", "cap": options.cap, **conditions()},
+        notes={"policy": "pick_place", "cap": options.cap, "contacts": options.contacts, **conditions()},
     )
 
 
@@ -329,6 +333,7 @@ class Setup:
 
     Attributes:
         recordings: folder of the recordings.
+        contacts: of the recordings and of every backend, see `vecenv.make`.
         scenes: folder of the exported scenes, None for the installed packages.
         episodes: of each task at most, None for all.
         ticks: of each replayed episode at most, None for all.
@@ -336,6 +341,7 @@ class Setup:
     """
 
     recordings: Path
+    contacts: Contacts = "published"
     scenes: str | None = None
     episodes: int | None = None
     ticks: int | None = None
@@ -348,6 +354,8 @@ def perform(job: Job, setup: Setup) -> Row:
     missing = sorted(set(job.tasks) - set(recording.task.tolist()))
     if missing:
         raise RecordingError(f"{recording_path(setup.recordings, job.suite)}: has no task {missing[0]}; record again")
+    if (recorded := recording.notes.get("contacts", EARLIER)) != setup.contacts:
+        raise RecordingError(f"{job.suite}: recorded with contacts={recorded}, not {setup.contacts}; record again")
     rows = recording.rows(job.tasks, setup.episodes)
     measured = (replayed if job.kind == "replay" else closed_loop)(job, setup, recording, rows)
     return {**asdict(job), "tasks": list(job.tasks), "episodes": len(rows), "device": device(job.backend), **measured}
@@ -362,6 +370,7 @@ def open_job(job: Job, setup: Setup, recording: Recording, rows: np.ndarray, **o
         episodes=episodes,
         backend=physics_of(job.backend),
         geometry=job.geometry,
+        contacts=setup.contacts,
         scenes=setup.scenes,
         **options,
     )
@@ -683,6 +692,7 @@ def compare(options: argparse.Namespace) -> None:
     """Do the jobs that the results file does not have yet; print a line a job."""
     setup = Setup(
         recordings=options.recordings,
+        contacts=options.contacts,
         scenes=options.scenes,
         episodes=options.episodes,
         ticks=options.ticks,
@@ -690,12 +700,15 @@ def compare(options: argparse.Namespace) -> None:
     )
     path = options.out / f"{NAME}.json"
     rows = {key_of(row): row for row in ([] if options.anew else read_rows([path])) if "error" not in row}
+    if other := contacts_of(list(rows.values())) - {options.contacts}:
+        raise SystemExit(f"{path} has rows with contacts={', '.join(other)}: another --out, or --anew to forget them")
     jobs = [job for job in jobs_of(options) if job.key not in rows]
     print(f"{len(jobs)} jobs, {len(rows)} rows are there already", flush=True)
     started = time.monotonic()
     for job, row in shared_out(jobs, setup, options):
         rows[job.key] = {
             **asdict(job),
+            "contacts": options.contacts,
             "workers": options.workers,
             "gpus": options.gpus,
             "at most": options.ticks,
@@ -711,6 +724,11 @@ def compare(options: argparse.Namespace) -> None:
 def key_of(row: Row) -> tuple[str, ...]:
     """``Job.key`` of a row."""
     return (row["kind"], row["scene"], row["backend"], row["geometry"])
+
+
+def contacts_of(rows: Sequence[Row]) -> set[str]:
+    """The contacts that rows were measured with."""
+    return {row.get("contacts", EARLIER) for row in rows}
 
 
 def line(row: Row) -> str:
@@ -770,6 +788,8 @@ def table(options: argparse.Namespace) -> None:
     rows = read_rows(options.results)
     if not rows:
         raise SystemExit(f"no rows in {', '.join(map(str, options.results))}")
+    if len(contacts_of(rows)) > 1:
+        raise SystemExit(f"rows with different contacts ({', '.join(sorted(contacts_of(rows)))}) do not make one table")
     options.out.write_text(markdown(rows))
     print(f"{len(rows)} rows in {options.out}")
 
@@ -787,7 +807,8 @@ def markdown(rows: Sequence[Row]) -> str:
         "Not compared": "\n".join(failed),
     }
     texts = [f"## {title}\n\n{text}" for title, text in sections.items() if text]
-    return "\n\n".join(["# Fidelity of MJX by suite and scene", INTRODUCTION, *texts]) + "\n"
+    contacts = f"Contacts on both sides: {', '.join(sorted(contacts_of(rows)))}."
+    return "\n\n".join(["# Fidelity of MJX by suite and scene", INTRODUCTION, contacts, *texts]) + "\n"
 
 
 INTRODUCTION = f"""Written by `python benchmarks/mjx_fidelity.py table`; all rows: `benchmarks/results/{NAME}.json`.
@@ -894,6 +915,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     both.add_argument("--suite", nargs="+", choices=SUITES, default=list(SUITES))
     both.add_argument("--scenes", help="folder that `vecenv compile` wrote; the installed packages otherwise")
     both.add_argument("--episodes", type=int, help="of each task, at most; all that are recorded, or 10 (50) to record")
+    both.add_argument("--contacts", choices=CONTACTS, default="published", help="of native and of all backends")
 
     stage = stages.add_parser("record", parents=[both], help="run pick_place on native MuJoCo")
     stage.add_argument("--out", type=Path, required=True, help="folder for the recordings")

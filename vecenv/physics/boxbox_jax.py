@@ -56,7 +56,7 @@ class _Found(NamedTuple):
 
 
 def collider(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A collision function of MJX: distances [8 N], positions [8 N, 3] and frames [8 N, 3, 3] of pairs of geoms [N, 2]."""
+    """A collision function of MJX: distances [8 N], positions [8 N, 3], frames [8 N, 3, 3] of pairs of geoms [N, 2]."""
     first, second = (Box(data.geom_xpos[g], data.geom_xmat[g], model.geom_size[g]) for g in geom.T)
     margin = model.geom_margin[geom].sum(-1)
     dist, pos, normal = jax.vmap(box_box)(first, second, margin)

@@ -1,13 +1,19 @@
 """Contacts of two boxes as MuJoCo 2.3 to 3.3 computed them, as a Warp function for CUDA and the CPU.
 
-The method, the order of the contacts and the halved depth of face contacts are those of ``vecenv.physics.boxbox``, which
-explains them; signature and result are those of MuJoCo Warp's own ``box_box``, in whose place it is called
+Method, order of the contacts and halved depth of face contacts are those of ``vecenv.physics.boxbox``, which explains
+them; signature and result are those of MuJoCo Warp's own ``box_box``, in whose place it is called
 (``vecenv.physics.mjx_contacts``). Everything is float32, in the world frame, metres.
 
 Single precision asks for one difference. An axis made of two nearly parallel edges is known only as well as the cross
 product of the edges, and where boxes rest flat on each other its overlap ties with that of a face: it has to win by
 more than what rounding makes of it.
 """
+
+# In Warp, int(0) makes a variable that a loop may change; a literal is a constant.
+# ruff: noqa: RUF046, UP018
+# The bodies are Warp's language, whose overloads pyright does not know.
+# pyright: basic, reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportReturnType=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
@@ -23,9 +29,14 @@ _TINY = 1e-12
 _OUTSIDE = 1.01
 _FAR = 1e10
 
-# Up to 24 candidates, see ``vecenv.physics.boxbox``: position and depth.
-candidates = wp.types.matrix(shape=(24, 4), dtype=wp.float32)
-corners = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
+
+class Candidates(wp.types.matrix(shape=(24, 4), dtype=wp.float32)):
+    """Candidates, see ``vecenv.physics.boxbox``: position and depth."""
+
+
+class Corners(wp.types.matrix(shape=(4, 3), dtype=wp.float32)):
+    """Corners of a face."""
+
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,7 +50,7 @@ def box_box(
     box2_rot: wp.mat33,
     box2_size: wp.vec3,
     margin: float,
-):  # noqa: ANN201 - Warp reads the types off the return statements.
+):
     """Contacts of two boxes: their number, distances [8], positions [8, 3], normal from the first to the second.
 
     Args:
@@ -56,7 +67,7 @@ def box_box(
     code, axis = _least_overlap(box1_size, box2_size, rot, centre2, centre1, margin)
     if code < 0:
         return 0, dist, pos, axis
-    found = candidates()
+    found = Candidates()
     count = int(0)
     normal = wp.vec3()
     if code >= 12:
@@ -96,7 +107,7 @@ def box_box(
 
 
 @wp.func
-def _to_world(found: candidates, count: int, pos: wp.vec3, rot: wp.mat33) -> candidates:
+def _to_world(found: Candidates, count: int, pos: wp.vec3, rot: wp.mat33) -> Candidates:
     """Candidates in a box's frame, in the world frame."""
     turned = found
     for n in range(count):
@@ -126,7 +137,7 @@ def _outside(point: wp.vec3, pos: wp.vec3, rot: wp.mat33, size: wp.vec3, margin:
 
 
 @wp.func
-def _least_overlap(size1: wp.vec3, size2: wp.vec3, rot: wp.mat33, centre2: wp.vec3, centre1: wp.vec3, margin: float):  # noqa: ANN202
+def _least_overlap(size1: wp.vec3, size2: wp.vec3, rot: wp.mat33, centre2: wp.vec3, centre1: wp.vec3, margin: float):
     """Number of the axis of least overlap, -1 where one separates the boxes; the axis itself for two edges."""
     total = size1[0] + size1[1] + size1[2] + size2[0] + size2[1] + size2[2]
     least = margin + 3.0 * total
@@ -194,7 +205,7 @@ def _half_sizes(frame: wp.mat33, size: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def _line(number: int, corner: wp.vec3, first: wp.vec3, second: wp.vec3):  # noqa: ANN202
+def _line(number: int, corner: wp.vec3, first: wp.vec3, second: wp.vec3):
     """Origin and step of the four sides of a parallelogram; the first alone is an edge."""
     if number == 0:
         return corner, first
@@ -217,7 +228,7 @@ def _rectangle_corner(number: int, half: wp.vec3) -> wp.vec3:
 @wp.func
 def _face_contacts(
     frame: wp.mat33, size: wp.vec3, other_size: wp.vec3, other_axes: wp.mat33, other_centre: wp.vec3, margin: float
-):  # noqa: ANN202
+):
     """Number of candidates on a face of a box, and the candidates in the box's frame, their depth halved."""
     axes = frame @ other_axes
     half = _half_sizes(frame, size)
@@ -235,7 +246,7 @@ def _face_contacts(
             else:
                 second = -2.0 * along
             flat += 1
-    found = candidates()
+    found = Candidates()
     count = int(0)
     lines = wp.where(flat == 2, 4, flat)
     for number in range(lines):
@@ -271,7 +282,7 @@ def _face_contacts(
 
 
 @wp.func
-def _add_point(found: candidates, count: int, point: wp.vec3):  # noqa: ANN202
+def _add_point(found: Candidates, count: int, point: wp.vec3):
     longer = found
     longer[count, 0] = point[0]
     longer[count, 1] = point[1]
@@ -280,9 +291,9 @@ def _add_point(found: candidates, count: int, point: wp.vec3):  # noqa: ANN202
 
 
 @wp.func
-def _halved(found: candidates, count: int, frame: wp.mat33, height: float, margin: float):  # noqa: ANN202
+def _halved(found: Candidates, count: int, frame: wp.mat33, height: float, margin: float):
     """Candidates of a face's frame half-way between the surfaces, with half the depth, in the box's frame."""
-    moved = candidates()
+    moved = Candidates()
     kept = int(0)
     for n in range(count):
         if found[n, 2] <= margin:
@@ -300,7 +311,7 @@ def _halved(found: candidates, count: int, frame: wp.mat33, height: float, margi
 @wp.func
 def _edge_contacts(
     code: int, size1: wp.vec3, size2: wp.vec3, rot: wp.mat33, centre2: wp.vec3, axis: wp.vec3, margin: float
-):  # noqa: ANN202
+):
     """Number of candidates about two edges, the candidates and the normal, in the frame of the first box."""
     e1 = code // 3
     e2 = code % 3
@@ -325,7 +336,7 @@ def _edge_contacts(
     half = _half_sizes(frame, size1)
     across = frame @ axis
     normal = axis * sign
-    found = candidates()
+    found = Candidates()
     if wp.abs(across[2]) < _TINY:
         return 0, found, normal
 
@@ -335,8 +346,8 @@ def _edge_contacts(
     along_step = _column(axes, along2) * (size2[along2] * _corner_side(rot, e1, e2, along2, away))
     centre += _column(axes, face2) * (size2[face2] * _corner_side(rot, e1, e2, face2, away))
     edge_step = _column(axes, e2) * size2[e2]
-    quad = corners()
-    flat_quad = corners()
+    quad = Corners()
+    flat_quad = Corners()
     for n in range(4):
         place = centre + wp.where(n < 2, along_step, -along_step) + wp.where(n % 2 == 0, edge_step, -edge_step)
         quad[n] = place
@@ -368,7 +379,7 @@ def _corner_side(rot: wp.mat33, e1: int, e2: int, k: int, away: bool) -> float:
 
 
 @wp.func
-def _edge_lines(found: candidates, quad: corners, flat_quad: corners, half: wp.vec3, rise: float, margin: float):  # noqa: ANN202
+def _edge_lines(found: Candidates, quad: Corners, flat_quad: Corners, half: wp.vec3, rise: float, margin: float):
     """Where the projected sides cross the borders of the rectangle."""
     longer = found
     count = int(0)
@@ -393,7 +404,7 @@ def _edge_lines(found: candidates, quad: corners, flat_quad: corners, half: wp.v
 
 
 @wp.func
-def _edge_corners(found: candidates, lines: int, quad: corners, flat_quad: corners, half: wp.vec3, margin: float):  # noqa: ANN202
+def _edge_corners(found: Candidates, lines: int, quad: Corners, flat_quad: Corners, half: wp.vec3, margin: float):
     """The rectangle's corners inside the projected face, or beside it where no side crosses the rectangle."""
     longer = found
     count = int(lines)
@@ -428,15 +439,15 @@ def _edge_corners(found: candidates, lines: int, quad: corners, flat_quad: corne
 
 @wp.func
 def _edge_vertices(
-    found: candidates,
+    found: Candidates,
     lines: int,
     have: int,
-    quad: corners,
-    flat_quad: corners,
+    quad: Corners,
+    flat_quad: Corners,
     half: wp.vec3,
     rise: float,
     margin: float,
-):  # noqa: ANN202
+):
     """The second box's corners above the rectangle, or near it where no side crosses the rectangle."""
     longer = found
     count = int(have)

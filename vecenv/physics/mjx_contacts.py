@@ -2,9 +2,9 @@
 
 MJX finds the collider of two geoms in a table, as MuJoCo does. This is the one place of vecenv that reaches into MJX's
 private modules. It leaves the tables and functions it finds there as they are: for marked models it runs copies of the
-functions that read a table of ours (``boxbox_warp``, ``planemesh_warp``, ``boxbox_jax``), and unmarked ones go where they
-always went. What is a mark is decided by ``vecenv.libero.contacts``; a model of MuJoCo Warp has no custom numbers, there it
-is a bit of the disable flags that MuJoCo does not use.
+functions that read a table of ours (``boxbox_warp``, ``planemesh_warp``, ``boxbox_jax``), and unmarked ones go where
+they always went. What is a mark is decided by ``vecenv.libero.contacts``; a model of MuJoCo Warp has no custom numbers,
+there it is a bit of the disable flags that MuJoCo does not use.
 
 A MuJoCo that arranges these functions in another way is refused with ``MjxContactsError``, which says so.
 """
@@ -118,16 +118,26 @@ def install_warp() -> None:
         MjxContactsError: see ``_expect``.
     """
     from mujoco.mjx.third_party.mujoco_warp._src import collision_driver as driver
-    from mujoco.mjx.third_party.mujoco_warp._src.warp_util import event_scope
 
     with _LOCK:
-        current = getattr(driver, "primitive_narrowphase", None)
-        _expect(getattr(driver, "_narrowphase", None), "m d ctx", "primitive_narrowphase", "NATIVECCD", "PRIMITIVE")
-        plain = _expect(current, "m d ctx collision_table", "_PRIMITIVE_COLLISIONS", "_primitive_narrowphase")
-        copy = _reading(plain, "published_narrowphase", _PRIMITIVE_COLLISIONS=_warp_colliders())
-        driver.primitive_narrowphase = _either(
-            event_scope(copy), current, lambda model: bool(int(model.opt.disableflags) & PUBLISHED)
-        )
+        published, current = _warp_narrowphase(), driver.primitive_narrowphase
+        driver.primitive_narrowphase = _either(published, current, _has_bit)
+
+
+def _has_bit(model: Any) -> bool:
+    """Whether a model of MuJoCo Warp, or an MJX model for it, is to have published contacts."""
+    return bool(int(model.opt.disableflags) & PUBLISHED)
+
+
+def _warp_narrowphase() -> Callable[..., Any]:
+    """MuJoCo Warp's narrow phase of primitive geoms with our colliders in it."""
+    from mujoco.mjx.third_party.mujoco_warp._src import collision_driver as driver
+    from mujoco.mjx.third_party.mujoco_warp._src.warp_util import event_scope
+
+    _expect(getattr(driver, "_narrowphase", None), "m d ctx", "primitive_narrowphase", "NATIVECCD", "PRIMITIVE")
+    current = getattr(driver, "primitive_narrowphase", None)
+    plain = _expect(current, "m d ctx collision_table", "_PRIMITIVE_COLLISIONS", "_primitive_narrowphase")
+    return event_scope(_reading(plain, "published_narrowphase", _PRIMITIVE_COLLISIONS=_warp_colliders()))
 
 
 def _warp_colliders() -> dict[Any, Any]:
@@ -162,14 +172,20 @@ def install_jax() -> None:
         MjxContactsError: see ``_expect``.
     """
     with _LOCK:
-        table, boxes = dict(getattr(jax_driver, "_COLLISION_FUNC", {})), (mjx.GeomType.BOX, mjx.GeomType.BOX)
-        _expect(table.get(boxes), "m d key geom")
-        if not hasattr(table[boxes], "ncon"):
-            raise _unknown("its collision functions have no number of contacts")
-        table[boxes] = boxbox_jax.collider
-        for name, arguments in (("collision", "m d"), ("make_condim", "m impl")):
-            current = getattr(jax_driver, name, None)
-            plain = _expect(current, arguments, "_COLLISION_FUNC")
-            copy = _reading(plain, f"published_{name}", _COLLISION_FUNC=table)
-            setattr(jax_driver, name, _either(copy, current, _is_marked))
+        for name, published in _jax_functions().items():
+            setattr(jax_driver, name, _either(published, getattr(jax_driver, name), _is_marked))
         mjx.collision = jax_driver.collision
+
+
+def _jax_functions() -> dict[str, Callable[..., Any]]:
+    """MJX's functions that read its table of colliders, reading one with ours in it."""
+    table, boxes = dict(getattr(jax_driver, "_COLLISION_FUNC", {})), (mjx.GeomType.BOX, mjx.GeomType.BOX)
+    _expect(table.get(boxes), "m d key geom")
+    if not hasattr(table[boxes], "ncon"):
+        raise _unknown("its collision functions have no number of contacts")
+    table[boxes] = boxbox_jax.collider
+    found = {}
+    for name, arguments in (("collision", "m d"), ("make_condim", "m impl")):
+        plain = _expect(getattr(jax_driver, name, None), arguments, "_COLLISION_FUNC")
+        found[name] = _reading(plain, f"published_{name}", _COLLISION_FUNC=table)
+    return found

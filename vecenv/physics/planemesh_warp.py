@@ -4,6 +4,12 @@ The method is that of ``vecenv.physics.planemesh``; signature and result are tho
 whose place it is called (``vecenv.physics.mjx_contacts``), and which still serves meshes without a hull.
 """
 
+# In Warp, int(0) makes a variable that a loop may change; a literal is a constant.
+# ruff: noqa: RUF046, UP018
+# The bodies are Warp's language, whose overloads pyright does not know.
+# pyright: basic, reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportReturnType=false, reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import warp as wp
@@ -21,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def plane_convex(plane_normal: wp.vec3, plane_pos: wp.vec3, convex: Geom, margin: float):  # noqa: ANN201
+def plane_convex(plane_normal: wp.vec3, plane_pos: wp.vec3, convex: Geom, margin: float):
     """Distances [4] and positions [4, 3] of the contacts, and the plane's normal; distances of the others are huge.
 
     Args:
