@@ -11,6 +11,7 @@ A MuJoCo that arranges these functions in another way is refused with ``MjxConta
 
 from __future__ import annotations
 
+import copy
 import functools
 import importlib.metadata
 import inspect
@@ -23,7 +24,7 @@ import mujoco
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver as jax_driver
 
-from vecenv.libero.contacts import MARK
+from vecenv.libero.contacts import MARK, MESH_MARGIN
 from vecenv.physics import boxbox_jax
 
 # The bit of a Warp model's disable flags that asks for published contacts.
@@ -49,12 +50,20 @@ def put_model(model: mujoco.MjModel, *, impl: str) -> mjx.Model:
     """
     if not _is_marked(model):
         return mjx.put_model(model, impl=impl)
+    model = _without_mesh_margins(model)
     if impl != "warp":
         install_jax()
         return mjx.put_model(model, impl=impl)
     install_warp()
     put = mjx.put_model(model, impl=impl)
     return put.replace(opt=put.opt.replace(disableflags=put.opt.disableflags | _BOXES_ARE_PRIMITIVE | PUBLISHED))
+
+
+def _without_mesh_margins(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy without what picks a path of native EPA: pure JAX has no margins of meshes, and neither needs them."""
+    model = copy.copy(model)
+    model.geom_margin[model.geom_margin == MESH_MARGIN] = 0.0
+    return model
 
 
 def _is_marked(model: Any) -> bool:
