@@ -154,7 +154,10 @@ def _warp_colliders() -> dict[Any, Any]:
     import warp as wp
     from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive as primitive
 
-    from vecenv.physics import boxbox_warp, planemesh_warp
+    try:
+        from vecenv.physics import boxbox_warp, planemesh_warp
+    except (ImportError, AttributeError) as error:
+        raise _unknown(f"a type or function of MuJoCo Warp is missing ({error})") from error
 
     table, kind = dict(getattr(primitive, "_PRIMITIVE_COLLISIONS", {})), primitive.GeomType
     boxes = "box1_pos box1_rot box1_size box2_pos box2_rot box2_size margin"
