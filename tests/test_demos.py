@@ -205,7 +205,7 @@ NAN = np.where(np.arange(4)[:, None] == 2, np.nan, np.ones((4, 7)))
         (attribute("make", "{"), r"attribute make: not JSON"),
         (attribute("make", "[" * 10_000), r"attribute make: not JSON"),
         (attribute("make", "[]"), r"attribute make: expected a JSON object, got list"),
-        (attribute("make", '{"scenes": "elsewhere"}'), r"attribute make: 'scenes' is none of backend, contacts, fixtures"),
+        (attribute("make", '{"scenes": "elsewhere"}'), r"attribute make: 'scenes' is none of backend, contacts"),
         (attribute("make", '{"seed": "x"}'), r"attribute make: seed='x': expected int"),
         (attribute("make", '{"settle_steps": 999999999}'), r"settle_steps=999999999: more than 1,000"),
         (attribute("make", "{}"), r"attribute episode: expected 0 to 49, got None"),

@@ -23,11 +23,10 @@ import functools
 import math
 from typing import Any
 
-import numba
 import numpy as np
 from numba import types
 
-from vecenv.physics.compiled import compile_for_c, floats_at, part, stack_array
+from vecenv.physics.compiled import carray, compile_for_c, floats_at, part, stack_array
 
 # Contacts a pair can have: what MuJoCo 3.17 reserves for two boxes.
 MOST = 8
@@ -78,33 +77,33 @@ def compiled() -> Any:
 def _collide(pos1: Any, mat1: Any, size1: Any, pos2: Any, mat2: Any, size2: Any, margin: Any, rows: Any) -> Any:
     """Write contacts to ``rows`` [8, 10] and return their number."""
     return _contacts(
-        numba.carray(floats_at(pos1), (3,)),
-        numba.carray(floats_at(mat1), (9,)),
-        numba.carray(floats_at(size1), (3,)),
-        numba.carray(floats_at(pos2), (3,)),
-        numba.carray(floats_at(mat2), (9,)),
-        numba.carray(floats_at(size2), (3,)),
+        carray(floats_at(pos1), (3,)),
+        carray(floats_at(mat1), (9,)),
+        carray(floats_at(size1), (3,)),
+        carray(floats_at(pos2), (3,)),
+        carray(floats_at(mat2), (9,)),
+        carray(floats_at(size2), (3,)),
         margin,
-        numba.carray(floats_at(rows), (MOST, COLUMNS)),
+        carray(floats_at(rows), (MOST, COLUMNS)),
     )
 
 
 @part
 def _contacts(pos1: Any, mat1: Any, size1: Any, pos2: Any, mat2: Any, size2: Any, margin: Any, rows: Any) -> int:
-    rot = numba.carray(stack_array(9), (3, 3))  # the second box's axes, as columns, in the frame of the first
-    between = numba.carray(stack_array(6), (2, 3))  # from either centre to the other, in its own frame
-    axis = numba.carray(stack_array(3), (3,))
+    rot = carray(stack_array(9), (3, 3))  # the second box's axes, as columns, in the frame of the first
+    between = carray(stack_array(6), (2, 3))  # from either centre to the other, in its own frame
+    axis = carray(stack_array(3), (3,))
     _relative(pos1, mat1, pos2, mat2, rot, between)
     code = _least_overlap(size1, size2, rot, between, margin, axis)
     if code < 0:
         return 0
-    points = numba.carray(stack_array(72), (_CANDIDATES, 3))
-    depth = numba.carray(stack_array(24), (_CANDIDATES,))
-    normal = numba.carray(stack_array(3), (3,))
+    points = carray(stack_array(72), (_CANDIDATES, 3))
+    depth = carray(stack_array(24), (_CANDIDATES,))
+    normal = carray(stack_array(3), (3,))
     if code >= 12:
         count = _edge_contacts(code - 12, pos1, mat1, size1, size2, rot, between, axis, margin, points, depth, normal)
     elif code >= 6:
-        turned = numba.carray(stack_array(9), (3, 3))
+        turned = carray(stack_array(9), (3, 3))
         for i in range(3):
             for k in range(3):
                 turned[i, k] = rot[k, i]
@@ -197,9 +196,9 @@ def _face_contacts(
 
     ``other_axes`` (columns) and ``other_centre`` are the other box's, in this box's frame.
     """
-    axes = numba.carray(stack_array(9), (3, 3))
-    half = numba.carray(stack_array(3), (3,))
-    corner = numba.carray(stack_array(3), (3,))
+    axes = carray(stack_array(9), (3, 3))
+    half = carray(stack_array(3), (3,))
+    corner = carray(stack_array(3), (3,))
     _turn_into_face(face, size, other_axes, other_centre, axes, half, corner)
     lowest = 0  # bit k: the lowest corner lies towards plus along axis k
     for k in range(3):
@@ -209,7 +208,7 @@ def _face_contacts(
         step = other_size[k] * (1 if lowest & (1 << k) else -1)
         for i in range(3):
             corner[i] += axes[i, k] * step
-    edges = numba.carray(stack_array(6), (2, 3))
+    edges = carray(stack_array(6), (2, 3))
     flat = 0
     for k in range(3):
         if abs(axes[2, k]) < 0.5 and flat < 2:  # three would be shorter than a unit vector
@@ -363,18 +362,18 @@ def _edge_contacts(
     side_along = _corner_side(rot, e1, e2, along2, away)
     side_face = _corner_side(rot, e1, e2, face2, away)
 
-    axes = numba.carray(stack_array(9), (3, 3))
-    half = numba.carray(stack_array(3), (3,))
-    centre = numba.carray(stack_array(3), (3,))
+    axes = carray(stack_array(9), (3, 3))
+    half = carray(stack_array(3), (3,))
+    centre = carray(stack_array(3), (3,))
     _turn_into_face(face, size1, rot, between[0], axes, half, centre)
-    across = numba.carray(stack_array(3), (3,))
+    across = carray(stack_array(3), (3,))
     for i in range(3):
         across[i] = axis[_AXIS[face, i]] * _SIGN[face, i]
     if abs(across[2]) < _MINVAL:
         return 0
-    quad = numba.carray(stack_array(12), (4, 3))  # the second box's face
+    quad = carray(stack_array(12), (4, 3))  # the second box's face
     _face_corners(axes, centre, size2, e2, along2, side_along, face2, side_face, quad)
-    flat_quad = numba.carray(stack_array(12), (4, 3))  # the same, projected along the axis
+    flat_quad = carray(stack_array(12), (4, 3))  # the same, projected along the axis
     for n in range(4):
         step = -quad[n, 2] * (1 / across[2])
         for i in range(3):

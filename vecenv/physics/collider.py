@@ -23,11 +23,10 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
 from vecenv.libero.contacts import MARK, mark
 from vecenv.physics import boxbox, planemesh
-from vecenv.physics.compiled import address_at, compile_for_c, floats_at, int32_at, part
+from vecenv.physics.compiled import address_at, builtin, compile_for_c, floats_at, int32_at, part
 
 _PLANE, _BOX, _MESH = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "BOX", "MESH"))
 _GEOM_TYPES = int(mujoco.mjtGeom.mjGEOM_SDF) + 1
@@ -194,7 +193,7 @@ def _compiled() -> tuple[Any, Any]:
     return compile_for_c(signature, _box_box), compile_for_c(signature, _plane_mesh)
 
 
-@intrinsic
+@builtin
 def _layout(typingctx: Any, index: Any) -> Any:
     """An entry of ``_LAYOUT``."""
 
@@ -207,7 +206,7 @@ def _layout(typingctx: Any, index: Any) -> Any:
     return types.uintp(types.int64), codegen
 
 
-@intrinsic
+@builtin
 def _call(typingctx: Any, function: Any, arguments: Any) -> Any:
     """Call a C function that returns an int32 by its address, with a tuple of arguments."""
 

@@ -16,7 +16,14 @@ from numba.extending import intrinsic
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
 # What only compiled code calls needs no entry from Python or C; called from Python nevertheless, it crashes.
-part = numba.njit(**OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+part = numba.njit(**_INNER)
+carray: Any = numba.carray  # pyright: ignore[reportPrivateImportUsage]
+
+
+def builtin(function: Callable[..., Any]) -> Any:
+    """An operation of compiled code that is written in LLVM's terms; literal arguments are known as such."""
+    return intrinsic(prefer_literal=True)(function)
 
 
 def compile_for_c(signature: Any, function: Callable[..., Any]) -> Any:
@@ -27,7 +34,7 @@ def compile_for_c(signature: Any, function: Callable[..., Any]) -> Any:
         return numba.cfunc(signature, **OPTIONS)(function)
 
 
-@intrinsic(prefer_literal=True)
+@builtin
 def stack_array(typingctx: Any, size: Any) -> Any:
     """Pointer to ``size`` (a literal) floats on the stack of the calling function: no memory is allocated."""
     if not isinstance(size, types.IntegerLiteral):
@@ -45,31 +52,31 @@ def stack_array(typingctx: Any, size: Any) -> Any:
 # Memory of C libraries, by address.
 
 
-@intrinsic
+@builtin
 def int32_at(typingctx: Any, address: Any) -> Any:
     """The int32 at an address."""
     return types.int32(types.uintp), _loader(ir.IntType(32))
 
 
-@intrinsic
+@builtin
 def address_at(typingctx: Any, address: Any) -> Any:
     """The pointer at an address, as a number."""
     return types.uintp(types.uintp), _loader(ir.IntType(64))
 
 
-@intrinsic
+@builtin
 def floats_at(typingctx: Any, address: Any) -> Any:
     """An address as a pointer to float64."""
     return types.CPointer(types.float64)(types.uintp), _pointer(ir.DoubleType())
 
 
-@intrinsic
+@builtin
 def singles_at(typingctx: Any, address: Any) -> Any:
     """An address as a pointer to float32."""
     return types.CPointer(types.float32)(types.uintp), _pointer(ir.FloatType())
 
 
-@intrinsic
+@builtin
 def int32s_at(typingctx: Any, address: Any) -> Any:
     """An address as a pointer to int32."""
     return types.CPointer(types.int32)(types.uintp), _pointer(ir.IntType(32))

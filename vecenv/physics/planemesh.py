@@ -14,10 +14,9 @@ import functools
 import math
 from typing import Any
 
-import numba
 from numba import types
 
-from vecenv.physics.compiled import compile_for_c, floats_at, int32s_at, part, singles_at, stack_array
+from vecenv.physics.compiled import carray, compile_for_c, floats_at, int32s_at, part, singles_at, stack_array
 
 MOST = 3
 # Columns of a contact, see ``vecenv.physics.boxbox``.
@@ -46,14 +45,14 @@ def _collide(
         margin: contacts up to this distance are reported, metres.
         rows: address of the contacts.
     """
-    turn, at = numba.carray(floats_at(plane_mat), (9,)), numba.carray(floats_at(plane_pos), (3,))
-    own, centre = numba.carray(floats_at(mat), (9,)), numba.carray(floats_at(pos), (3,))
-    hull = numba.carray(int32s_at(graph), (2,))
+    turn, at = carray(floats_at(plane_mat), (9,)), carray(floats_at(plane_pos), (3,))
+    own, centre = carray(floats_at(mat), (9,)), carray(floats_at(pos), (3,))
+    hull = carray(int32s_at(graph), (2,))
     count, faces = hull[0], hull[1]
-    hull = numba.carray(int32s_at(graph), (2 + 3 * count + 3 * faces,))
-    points = numba.carray(singles_at(vertices), (1, 3))
-    found = numba.carray(floats_at(rows), (MOST, _COLUMNS))
-    down = numba.carray(stack_array(3), (3,))  # the mesh's own direction towards the plane
+    hull = carray(int32s_at(graph), (2 + 3 * count + 3 * faces,))
+    points = carray(singles_at(vertices), (1, 3))
+    found = carray(floats_at(rows), (MOST, _COLUMNS))
+    down = carray(stack_array(3), (3,))  # the mesh's own direction towards the plane
     for i in range(3):
         down[i] = own[i] * -turn[2] + own[3 + i] * -turn[5] + own[6 + i] * -turn[8]
     lowest = _lowest(hull, count, points, down)
@@ -102,7 +101,7 @@ def _contact(
     margin: Any,
 ) -> bool:
     """Write a vertex's contact to a row, if it is within the margin and far enough from the first contact."""
-    place = numba.carray(stack_array(3), (3,))
+    place = carray(stack_array(3), (3,))
     distance, gap = 0.0, 0.0
     for i in range(3):
         x, y, z = points[vertex, 0], points[vertex, 1], points[vertex, 2]
