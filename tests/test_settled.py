@@ -10,7 +10,7 @@ import pytest
 
 import vecenv
 from vecenv.libero import settled
-from vecenv.libero.env import LiberoEnv, LiberoError
+from vecenv.libero.env import LiberoEnv
 from vecenv.libero.suites import TaskSpec, list_suites, list_tasks, task
 
 IDLE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
@@ -76,9 +76,12 @@ def test_where_versions_agree_settling_live_gives_the_same_rollout() -> None:
     np.testing.assert_allclose(shipped.observe_egocentric().state, live.observe_egocentric().state, atol=1e-4)
 
 
-def test_fixtures_elsewhere_need_raw_starts() -> None:
-    with pytest.raises(LiberoError, match="start='raw'"):
-        vecenv.make("libero_goal", task=0, episodes=[0], fixtures="sampled")
+def test_fixtures_elsewhere_settle_elsewhere() -> None:
+    central, sampled = (make("libero_goal", task=0, episodes=[0], fixtures=kind) for kind in ("center", "sampled"))
+    places = [env.physics.groups[0].expand("body_pos") for env in (central, sampled)]
+    assert np.abs(places[0] - places[1]).max() > 1e-3
+    assert (central.state().qpos != sampled.state().qpos).any()
+    np.testing.assert_array_equal(central.state().time, sampled.state().time)
 
 
 def altered(spec: TaskSpec) -> TaskSpec:

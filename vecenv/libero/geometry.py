@@ -347,7 +347,9 @@ class _Rebuild:
         geom.condim, geom.priority = int(model.geom_condim[like]), int(model.geom_priority[like])
         geom.friction, geom.solmix = model.geom_friction[like], float(model.geom_solmix[like])
         geom.solref, geom.solimp = model.geom_solref[like], model.geom_solimp[like]
-        geom.margin, geom.gap = float(model.geom_margin[like]), float(model.geom_gap[like])
+        margin = float(model.geom_margin[like])
+        geom.margin = 0.0 if margin == contacts.MESH_MARGIN else margin  # what stands for a mesh is none
+        geom.gap = float(model.geom_gap[like])
         return geom
 
     def _keep_masses(self) -> None:

@@ -25,12 +25,13 @@ from vecenv.libero import cache
 from vecenv.libero.scene import CONTACT_LIMIT, PAIR_LIMIT, Scene
 from vecenv.physics.base import Group, Start
 
-# Factors on the most that was seen.
-MARGINS = {"contacts": 1.25, "rows": 1.3, "pairs": 1.5, "candidates": 1.5, "share": 1.75}
+# Factors on the most that was seen. Two boxes of published contacts have up to eight, and how many changes from substep
+# to substep while fingers press: 1.3 times the rows were too few for libero_10 task 0 (5 of 10 episodes of pick_place).
+MARGINS = {"contacts": 1.5, "rows": 2.0, "pairs": 1.5, "candidates": 1.5, "share": 1.75}
 # Control ticks of the two rollouts.
 FLAILING, GRASPING = 60, 80
 # Part of the cache key: raised when what is measured changes.
-VERSION = 6
+VERSION = 7
 _HOLD = 5
 _DOWNWARDS = np.array([0, 0, -0.5, 0, 0, 0, 0])
 # A grasp: ticks until the hand is above an object, on it, holds it, has dragged it about, and has pressed it down.
