@@ -20,12 +20,12 @@ from typing import Any
 
 from common import ROOT, report
 from images_peer import MOMENTS
-from pictures import Reference, agreement
+from support.pictures import Reference, agreement
 
-from vecenv.libero import suites
-from vecenv.libero.bddl import SceneKey
-from vecenv.render.gl import choose
-from vecenv.render.options import RenderConfig
+from vecenv.libero.render.gl import choose
+from vecenv.libero.render.options import RenderConfig
+from vecenv.libero.scene.bddl import SceneKey
+from vecenv.libero.tasks import suites
 
 PUBLISHED = "3.3.0"
 REFERENCES = ROOT / "build" / "upstream_images"

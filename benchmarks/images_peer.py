@@ -38,9 +38,9 @@ def is_current(path: Path, wanted: dict[str, Any]) -> bool:
 
 def record(suite: str, task: int, episode: int, size: int, moments: int) -> dict[str, np.ndarray]:
     """The arrays of one scene's file, without ``about``, of the first so many moments."""
-    import upstream
+    from support import upstream
 
-    from vecenv.libero import suites
+    from vecenv.libero.tasks import suites
 
     spec = suites.list_tasks(suite)[task]
     rng = np.random.default_rng(task)

@@ -26,10 +26,10 @@ from jax import lax
 from mujoco import mjx
 
 import vecenv
-from vecenv.libero.contacts import CONTACTS
 from vecenv.libero.env import LiberoEnv
-from vecenv.physics.base import SUBSTEPS
-from vecenv.physics.mjx import MjxGroup, World, control_step, jit
+from vecenv.libero.physics.base import SUBSTEPS
+from vecenv.libero.physics.mjx.backend import MjxGroup, World, control_step, jit
+from vecenv.libero.scene.contacts import CONTACTS
 
 CHUNK = 10
 # How XLA, CUDA and Warp say it.

@@ -3,8 +3,8 @@
 The rows: the batched environment on ``impl="jax"`` with lean geometry against the native backend on the same scene
 and actions, in alternation, and the processor time of all cores that a step takes, which others' work changes little.
 Beside them in the file, "fusion trap": a function compiled with the options of
-``vecenv.physics.mjx.compiler_options`` and without; and "compile": seconds to trace and to compile a chunk of control
-steps in a process with empty caches, and in a second process that finds them.
+``vecenv.libero.physics.mjx.backend.compiler_options`` and without; and "compile": seconds to trace and to compile a
+chunk of control steps in a process with empty caches, and in a second process that finds them.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def trap(options: argparse.Namespace) -> dict[str, Any]:
     from mjx import alternate
     from mujoco import mjx
 
-    from vecenv.physics.mjx import compiler_options, substep
+    from vecenv.libero.physics.mjx.backend import compiler_options, substep
 
     (scene,), (name,) = options.scene, options.function
     (group,) = ready_env(scene, "jax", 1).physics.groups

@@ -42,11 +42,11 @@ import numpy as np
 from common import RESULTS, ROOT
 
 import vecenv
-from vecenv.libero.contacts import CONTACTS, Contacts
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv
-from vecenv.libero.export import exported_tasks
-from vecenv.libero.scene import Scene
-from vecenv.libero.sources import Task, installed_tasks
+from vecenv.libero.scene.contacts import CONTACTS, Contacts
+from vecenv.libero.scene.scene import Scene
+from vecenv.libero.tasks.export import exported_tasks
+from vecenv.libero.tasks.sources import Task, installed_tasks
 
 # In the order in which they are compared: what is asked most strictly comes first.
 SUITES = ("libero_object", "libero_spatial", "libero_goal", "libero_10", "libero_90")
@@ -243,7 +243,7 @@ def run(env: LiberoEnv, chunk: np.ndarray, limit: np.ndarray) -> Ended:
 
 def play(env: LiberoEnv) -> tuple[np.ndarray, Ended]:
     """Let `pick_place` act until all slots are finished or given up; actions [B, K, 7], rounded to 32 bits."""
-    from eval.policies.pick_place import PickPlacePolicy
+    from vecenv_eval.policies.pick_place import PickPlacePolicy
 
     policy = PickPlacePolicy()
     policy.reset(env, env.reset())

@@ -178,9 +178,9 @@ def robot_touches(model: Any, data: Any) -> bool:
 def run(job: Job) -> Rollout:
     """Roll out one job with the environment that LIBERO itself would build."""
     import mujoco
-    import upstream
+    from support import upstream
 
-    from vecenv.libero import suites
+    from vecenv.libero.tasks import suites
 
     spec = suites.task(job.suite, job.task)
     peer = upstream.bare_peer(spec.bddl_path)
@@ -222,9 +222,9 @@ def _rollouts(asked: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _verdicts(asked: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    import upstream
+    from support import upstream
 
-    from vecenv.libero import suites
+    from vecenv.libero.tasks import suites
 
     spec = suites.task(str(asked["suite"]), int(asked["task"]))
     peer = upstream.peer_of(spec.bddl_path)

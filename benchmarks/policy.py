@@ -7,9 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from common import report
+from vecenv_eval.runner import EvalConfig, begin, evaluate
 
-from eval.runner import EvalConfig, begin, evaluate
-from vecenv.libero.suites import BASE_SUITES
+from vecenv.libero.tasks.suites import BASE_SUITES
 
 EPISODES = {"libero_object": "all", "libero_90": "2"}
 MAX_STEPS = 800

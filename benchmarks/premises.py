@@ -36,13 +36,13 @@ from common import RESULTS, report
 from mjx_fidelity import Worker, by_scene, tasks_of
 
 import vecenv
-from vecenv.libero import goals
-from vecenv.libero.arenas import ARENAS
-from vecenv.libero.bddl import Problem
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv
-from vecenv.libero.scene import compile_scene
-from vecenv.libero.suites import NUM_EPISODES
-from vecenv.physics.native import Group, Start
+from vecenv.libero.physics.native import Group, Start
+from vecenv.libero.scene import goals
+from vecenv.libero.scene.arenas import ARENAS
+from vecenv.libero.scene.bddl import Problem
+from vecenv.libero.scene.scene import compile_scene
+from vecenv.libero.tasks.suites import NUM_EPISODES
 
 IDLE_TICKS = 50
 MOVED = 0.005

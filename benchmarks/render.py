@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 from common import report
-from pictures import psnr, ssim
+from support.pictures import psnr, ssim
 
 import vecenv
-from vecenv.machine import usable_cores
-from vecenv.render.options import RenderConfig
+from vecenv.libero.render.options import RenderConfig
+from vecenv.util.cores import usable_cores
 
 TASKS = [("libero_object", 0), ("libero_spatial", 0), ("libero_10", 0)]
 SIZE = 256
@@ -32,7 +32,7 @@ SIZE = 256
 
 def upstream_batch(suite: str, task: int, workers: int) -> Callable[[np.ndarray], None]:
     """Upstream's vector environment, live; stepping takes actions [workers, 7]."""
-    import upstream
+    from support import upstream
 
     upstream._classes()
     with upstream.silence():

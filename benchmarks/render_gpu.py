@@ -27,9 +27,9 @@ from jax import lax
 from mjx import alternate, timed_first
 
 from vecenv.libero.functional import FunctionalConfig, LiberoEnv, jit
-from vecenv.render.options import POLICY_CAMERAS
-from vecenv.render.raytrace import RayTracer
-from vecenv.render.scenery import Scenery
+from vecenv.libero.render.options import POLICY_CAMERAS
+from vecenv.libero.render.raytrace import RayTracer
+from vecenv.libero.render.scenery import Scenery
 
 # Control steps of one timed call.
 STEPS = 4
@@ -213,8 +213,8 @@ def save_pictures(path: Path, left: np.ndarray, right: np.ndarray) -> None:
 def write(options: argparse.Namespace) -> None:
     """Sceneries and references of the scenes."""
     import vecenv
-    from vecenv.libero.scene import compile_scene
-    from vecenv.render.scenery import scenery_of
+    from vecenv.libero.render.scenery import scenery_of
+    from vecenv.libero.scene.scene import compile_scene
 
     for scene in options.scene:
         suite, task = scene.rsplit("/", 1)
@@ -229,7 +229,7 @@ def write(options: argparse.Namespace) -> None:
 def references(suite: str, task: int, size: int) -> dict[str, Any]:
     """States of two episodes, at their start and after eight random actions, and GL's pictures of them."""
     import vecenv
-    from vecenv.render.options import RenderConfig
+    from vecenv.libero.render.options import RenderConfig
 
     env = vecenv.make(suite, task=task, episodes=[0, 7], render=RenderConfig(height=size, width=size))
     env.reset()
@@ -243,7 +243,7 @@ def references(suite: str, task: int, size: int) -> dict[str, Any]:
 
 def snapshot(env: Any) -> dict[str, np.ndarray]:
     """The poses of a batch's bodies, its joints, and what its cameras show."""
-    from vecenv.render.raytrace import poses
+    from vecenv.libero.render.raytrace import poses
 
     seen, (group,) = env.observe_egocentric(), env.physics.groups
     xpos, xquat = poses(group.scene.model, group.seen_qpos, group.expand("body_pos"), group.expand("body_quat"))

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from common import ROOT
 from images import REFERENCES, RENDER, add_peer, write_references
-from pictures import Reference, agreement, ssim
+from support.pictures import Reference, agreement, ssim
 
 SCENES = ("libero_object-0", "libero_spatial-0", "libero_goal-0", "libero_10-0")
 FOLDER = ROOT / "docs" / "rendering"

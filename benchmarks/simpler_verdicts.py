@@ -20,8 +20,8 @@ from typing import Any
 
 import common
 import numpy as np
+from vecenv_eval.policies import make_policy
 
-from eval.policies import make_policy
 from vecenv.contract import Control
 from vecenv.simpler.env import SimplerEnv, make
 from vecenv.simpler.layouts import episode_seed

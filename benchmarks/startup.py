@@ -93,7 +93,7 @@ def compile_all(cache: str) -> dict[str, float]:
 def switches(slots: int, scenes: Path) -> list[dict[str, float]]:
     """From one scene of libero_90 to the next, until its first step is done; all of its scenes."""
     import vecenv
-    from vecenv.libero.suites import list_tasks
+    from vecenv.libero.tasks.suites import list_tasks
 
     first_of = {spec.problem().scene_key(): spec.index for spec in reversed(list_tasks("libero_90"))}
     tasks = sorted(first_of.values())
@@ -135,7 +135,7 @@ def main() -> None:
 
 
 def measure(folder: Path, slots: int, repeat: int) -> list[dict[str, Any]]:
-    from vecenv.libero.export import export
+    from vecenv.libero.tasks.export import export
 
     cache, exported, jax = folder / "cache", folder / "exported", str(folder / "jax")
     export(exported, ["libero_spatial", "libero_90"])

@@ -74,7 +74,7 @@ def twins(job: Job, theirs: Rollout, python: str) -> tuple[float, float]:
 
 def main() -> None:
     """Compare one task of every scene, and two of those that several tasks share."""
-    import upstream
+    from support import upstream
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=32, help="how many scenes")

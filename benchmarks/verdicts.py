@@ -17,15 +17,16 @@ import numpy as np
 import peer
 from common import report
 from rich.progress import track
+from vecenv_eval.policies import make_policy
 
 import vecenv
-from eval.policies import make_policy
 from vecenv.contract import BatchEnv
-from vecenv.libero import fixtures, goals
-from vecenv.libero.contacts import Contacts
 from vecenv.libero.env import LiberoEnv
-from vecenv.libero.scene import compile_scene
-from vecenv.libero.suites import BASE_SUITES, TaskSpec, list_tasks
+from vecenv.libero.scene import goals
+from vecenv.libero.scene.contacts import Contacts
+from vecenv.libero.scene.scene import compile_scene
+from vecenv.libero.tasks import fixtures
+from vecenv.libero.tasks.suites import BASE_SUITES, TaskSpec, list_tasks
 
 EPISODES = 4
 RANDOM_TICKS, POLICY_TICKS, EVERY = 40, 160, 8
@@ -61,9 +62,9 @@ def rollout_states(spec: TaskSpec, kind: str, contacts: Contacts) -> list[np.nda
 
 def compare(spec: TaskSpec, contacts: Contacts, python: str) -> tuple[Counter[str], int, int]:
     """How many states of each kind, on how many both say yes, and on how many they differ."""
-    from goal_states import GoalStates, Simulation
+    from support.goal_states import GoalStates, Simulation
 
-    from vecenv.libero import settled
+    from vecenv.libero.tasks import settled
 
     problem, rng = spec.problem(), np.random.default_rng(spec.index)
     scene = compile_scene(problem, contact_pairs=goals.contact_pairs([problem]), contacts=contacts)

@@ -13,8 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from common import report
-
-from eval.runner import EvalConfig, EvalResult, begin, evaluate
+from vecenv_eval.runner import EvalConfig, EvalResult, begin, evaluate
 
 
 def main() -> None:

@@ -1,9 +1,10 @@
 """VoxPoser's planner and pushing search against their NumPy and SciPy references, both sides in one run.
 
-The references in ``tests/voxposer_reference.py`` make upstream's calls, one slot at a time; here all slots are planned
-in one call on JAX's default device. Problems are drawn with a fixed seed: boxes, cluttered tables, noise and open space
-on a 100³ grid. The sides take turns, and the medians are compared. Planner rows also say on how many problems the raw
-voxel paths are identical, which must be all of them, and how far the finished paths are apart at most, in voxels.
+The references in ``tests/support/voxposer_reference.py`` make upstream's calls, one slot at a time; here all slots are
+planned in one call on JAX's default device. Problems are drawn with a fixed seed: boxes, cluttered tables, noise and
+open space on a 100³ grid. The sides take turns, and the medians are compared. Planner rows also say on how many
+problems the raw voxel paths are identical, which must be all of them, and how far the finished paths are apart at most,
+in voxels.
 
     python benchmarks/voxposer_planner.py --batch 50
 """
@@ -19,10 +20,10 @@ import common
 import jax
 import numpy as np
 
-from voxposer.planner import PlannerConfig, optimize_paths
-from voxposer.push import PushConfig, best_push
+from voxposer.planning.planner import PlannerConfig, optimize_paths
+from voxposer.planning.push import PushConfig, best_push
 
-import voxposer_reference as reference  # isort: skip - common puts the tests on the path
+from support import voxposer_reference as reference  # isort: skip - common puts the tests on the path
 
 
 def main() -> None:

@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from vecenv.libero.geometry import PROFILES
-from vecenv.libero.objectives import OBJECTIVES
+from vecenv.libero.functional.objectives import OBJECTIVES
+from vecenv.libero.scene.lean.geometry import PROFILES
 
 try:
     from brax.training.agents.ppo import networks

@@ -3,7 +3,7 @@
     python examples/ppo.py --objective reach --num-envs 2048 --steps 3_000_000 --out runs/reach
     python examples/ppo.py --objective reach --steps 6_000_000 --out runs/reach --resume
 
-In: a task, an objective of ``vecenv.libero.objectives`` and the options below. Out, in the folder ``--out``:
+In: a task, an objective of ``vecenv.libero.functional.objectives`` and the options below. Out, in the folder ``--out``:
 ``curve.csv`` (one row an iteration), ``curve.png`` where matplotlib is installed, ``checkpoint.npz`` (all there is:
 networks, optimiser, worlds and random key, so a resumed run goes on as if it had not stopped), ``config.json`` and
 ``result.json`` with the success rate of the policy without noise.
@@ -33,8 +33,8 @@ import numpy as np
 from jax import lax
 
 from vecenv.libero import functional
-from vecenv.libero.geometry import PROFILES
-from vecenv.libero.objectives import OBJECTIVES
+from vecenv.libero.functional.objectives import OBJECTIVES
+from vecenv.libero.scene.lean.geometry import PROFILES
 
 try:
     import optax

@@ -20,14 +20,16 @@ from typing import TypeAlias
 
 import mujoco
 import numpy as np
+from vecenv_eval.policies import make_policy
 
-from eval.policies import make_policy
-from vecenv.libero import geometry, goals, recipes, suites
-from vecenv.libero import primitives as fits
-from vecenv.libero.bddl import SceneKey
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv, make
-from vecenv.libero.primitives import Solid
-from vecenv.libero.scene import Scene, scene_source
+from vecenv.libero.scene import goals
+from vecenv.libero.scene.bddl import SceneKey
+from vecenv.libero.scene.lean import geometry, recipes
+from vecenv.libero.scene.lean import primitives as fits
+from vecenv.libero.scene.lean.primitives import Solid
+from vecenv.libero.scene.scene import Scene, scene_source
+from vecenv.libero.tasks import suites
 
 PAGE = Path(__file__).parent.parent / "docs" / "geometry.md"
 PICTURES = PAGE.with_suffix("")

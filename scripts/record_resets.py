@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import upstream
+from support import upstream
 
-from vecenv.libero.suites import TaskSpec, list_tasks
+from vecenv.libero.tasks.suites import TaskSpec, list_tasks
 
 # A task of every workspace; with things in an open drawer, a microwave to open or close, a stove that is on, things on
 # fixtures and on other things.

@@ -1,4 +1,4 @@
-"""Record the rollouts of upstream under MuJoCo 3.3.0 that ``tests/test_parity.py`` rests on.
+"""Record the rollouts of upstream under MuJoCo 3.3.0 that ``tests/libero/physics/test_parity.py`` rests on.
 
     make upstream && python scripts/record_rollouts.py
 

@@ -35,7 +35,8 @@ class SimulationError(RuntimeError):
 
 
 class LoopBatch:
-    """The part of `mujoco.batch.Batch` that `vecenv.physics.native` uses, as a loop over one MjData a simulation."""
+    """The part of `mujoco.batch.Batch` that `vecenv.libero.physics.native` uses, as a loop over one MjData a
+    simulation."""
 
     def __init__(self, model: Any, nsim: int, nthread: int = 0, persistent: bool = False) -> None:
         self.model, self.nsim = model, nsim
@@ -122,10 +123,10 @@ def install_stand_in() -> None:
 
 def settle(spec: Any, ticks: int = SETTLE_TICKS) -> tuple[np.ndarray, np.ndarray]:
     """qpos [50, nq] and qvel [50, nv] of a task's starts after idle ticks, fixtures at the centres of their regions."""
-    from vecenv.libero import fixtures
     from vecenv.libero.env import SETTLE_ACTION
-    from vecenv.libero.scene import compile_scene
-    from vecenv.physics.native import NativePhysics, Start
+    from vecenv.libero.physics.native import NativePhysics, Start
+    from vecenv.libero.scene.scene import compile_scene
+    from vecenv.libero.tasks import fixtures
 
     problem, states = spec.problem(), spec.init_states()
     scene = compile_scene(problem, contacts="current")
@@ -145,8 +146,8 @@ def settle(spec: Any, ticks: int = SETTLE_TICKS) -> tuple[np.ndarray, np.ndarray
 
 def rest(exceptions: dict[str, Any], folder: Path) -> None:
     """How far the starts that a newer MuJoCo sees moving move under this one, in the same 50 idle ticks."""
-    from vecenv.libero import settled, suites
-    from vecenv.libero.scene import compile_scene
+    from vecenv.libero.scene.scene import compile_scene
+    from vecenv.libero.tasks import settled, suites
 
     for key, missed in exceptions.items():
         _, suite, index = key.split("/")
@@ -168,9 +169,9 @@ def settle_upstream(spec: Any, episode: int) -> np.ndarray:
     _compat.configure_robosuite()
     from libero.libero.envs.env_wrapper import ControlEnv
 
-    from vecenv.libero import fixtures
     from vecenv.libero.env import SETTLE_ACTION
-    from vecenv.libero.scene import compile_scene
+    from vecenv.libero.scene.scene import compile_scene
+    from vecenv.libero.tasks import fixtures
 
     scene = compile_scene(spec.problem(), contacts="current")
     peer = ControlEnv(str(spec.bddl_path), has_offscreen_renderer=False, use_camera_obs=False)
@@ -187,7 +188,7 @@ def settle_upstream(spec: Any, episode: int) -> np.ndarray:
 
 def check(count: int, folder: Path) -> None:
     """Compare what was written with upstream on random starts."""
-    from vecenv.libero import settled, suites
+    from vecenv.libero.tasks import settled, suites
 
     rng = np.random.default_rng(0)
     worst = 0.0
@@ -218,7 +219,7 @@ def main() -> None:
         raise SystemExit(f"this needs mujoco {WANTED}, found {mujoco.__version__}; run `make settled`")
     sys.path.insert(0, str(ROOT))
     install_stand_in()
-    from vecenv.libero import settled, suites
+    from vecenv.libero.tasks import settled, suites
 
     folder = arguments.out or settled.FOLDER
     if arguments.check:

@@ -1,4 +1,4 @@
-"""Write ``vecenv/simpler/manifest.json``: the files that SIMPLER's tasks open, with their sizes and hashes; and
+"""Write ``vecenv/simpler/assets/manifest.json``: the files that SIMPLER's tasks open, with their sizes and hashes; and
 ``manifest_variants.json``, those that only variant aggregation opens.
 
 In: an asset tree in the layout of ManiSkill2_real2sim, and a clone of that repository. Every file of the tree is
@@ -20,8 +20,8 @@ import subprocess
 import sys
 from pathlib import Path, PurePosixPath
 
-from vecenv.simpler import assets
-from vecenv.simpler.published import ROOMS
+from vecenv.simpler.assets import files as assets
+from vecenv.simpler.published.lists import ROOMS
 from vecenv.simpler.tasks import COKE_TABLE, DATA, PLAIN_TRIPLETS, TASKS, Stage, model_folder
 from vecenv.simpler.variants import DISTRACTORS, STAGES
 

@@ -1,4 +1,4 @@
-"""Make ``vecenv/render/simplified.npz``: simplified versions of all meshes that LIBERO's scenes draw.
+"""Make ``vecenv/libero/render/simplified.npz``: simplified versions of all meshes that LIBERO's scenes draw.
 
 Needs meshoptimizer's Python package (``pip install meshoptimizer``, a C++ compiler); users of vecenv need neither.
 Simplification stops at an error that no camera of the benchmark resolves: a pixel of the third-person image is about
@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.libero import suites
-from vecenv.libero.scene import compile_scene
-from vecenv.render import lod
+from vecenv.libero.render import lod
+from vecenv.libero.scene.scene import compile_scene
+from vecenv.libero.tasks import suites
 
 # Largest error in metres by level: of the gripper, which fills a third of the wrist image, of what it handles, and of
 # what stands at least a metre away.
@@ -70,7 +70,8 @@ def main() -> None:
 
 
 def _stored(level: str, meshes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Iterator[tuple[str, np.ndarray]]:
-    """What the file has of a level (``vecenv.render.lod.simplified``): kept triangles as steps from one to the next."""
+    """What the file has of a level (``vecenv.libero.render.lod.simplified``): kept triangles as steps from one to the
+    next."""
     kept, corners, normals = zip(*meshes, strict=True)
     yield f"{level}_kept", np.concatenate([np.diff(rows, prepend=0) for rows in kept]).astype(np.uint32)
     yield f"{level}_kept_counts", np.array([len(rows) for rows in kept])

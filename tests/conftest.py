@@ -32,7 +32,7 @@ def repository() -> Path:
 @pytest.fixture(scope="session")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small generated asset tree for SIMPLER; not to be written to."""
-    import simpler_assets_small
+    from support import simpler_assets_small
 
     return simpler_assets_small.build(tmp_path_factory.mktemp("small"))
 
@@ -40,6 +40,6 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """SIMPLER's own assets without what is only drawn; skips the test where there is no archive of them."""
-    from simpler_files import physics_files
+    from support.simpler_files import physics_files
 
     return physics_files(tmp_path_factory.mktemp("original"))

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fakes import SUITE, FakeWorld
 from rich.console import Console
+from support.fakes import SUITE, FakeWorld
 from typer.testing import CliRunner, Result
+from vecenv_eval import runner
+from vecenv_eval.cli import _progress
+from vecenv_eval.runner import Progress
 
-from eval import runner
-from eval.cli import _progress
-from eval.runner import Progress
 from vecenv import doctor
 from vecenv.cli import build_app, unknown
 from vecenv.doctor import Check, Report
@@ -189,7 +189,7 @@ def test_eval_hands_its_settings_on(world: FakeWorld) -> None:
 
 def test_a_policy_beside_the_user_is_found(world: FakeWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
-    source = "from eval.policies.scripted import ZeroPolicy\nclass Mine(ZeroPolicy):\n    name = 'mine'\n"
+    source = "from vecenv_eval.policies.scripted import ZeroPolicy\nclass Mine(ZeroPolicy):\n    name = 'mine'\n"
     Path("policy_beside_me.py").write_text(source)
     result = invoke("eval", "--suite", SUITE, "--policy", "policy_beside_me:Mine", "--out", "here")
     assert result.exit_code == 0, result.output

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import simpler_assets_small
 from rich.console import Console
+from support import simpler_assets_small
 
 from vecenv import doctor
 from vecenv.doctor import Check, Package, Report

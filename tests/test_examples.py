@@ -17,12 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.paths import REPOSITORY
 
 from vecenv import interop
 
 pytest.importorskip("optax")
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = REPOSITORY / "examples"
 # LLVM's optimisation off: programs compile several times faster.
 compiled = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 

@@ -17,7 +17,7 @@ import vecenv
 from vecenv.actions import GRIPPER
 from vecenv.assets import AssetsMissing
 from vecenv.contract import BatchEnv
-from vecenv.simpler.robots import GOOGLE_ROBOT, WIDOWX
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX
 
 BRIDGE, GOOGLE = "simpler/bridge", "simpler/google_robot"
 SPOON, COKE = "widowx_spoon_on_towel", "google_robot_pick_coke_can"

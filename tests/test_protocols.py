@@ -7,14 +7,14 @@ import json
 from typing import Any
 
 import pytest
+from vecenv_eval.demos.demos import make_options
+from vecenv_eval.runner import ConfigError, EvalConfig, Evaluation
 
 import vecenv
-from eval.demos import make_options
-from eval.runner import ConfigError, EvalConfig, Evaluation
 from vecenv.libero.env import LiberoConfig, LiberoEnv
-from vecenv.libero.suites import BASE_SUITES
+from vecenv.libero.render.options import RenderConfig
+from vecenv.libero.tasks.suites import BASE_SUITES
 from vecenv.protocols import DEFAULT, LIBERO, PROTOCOLS, SIMPLER, STATE_PARTS, ProtocolError, ResetLoop, protocol
-from vecenv.render.options import RenderConfig
 
 LIBERO_NAMES = ("seed", "openvla", "openvla-oft", "openpi", "lerobot", "vla-eval", "rlinf", "torchrl")
 HORIZONS = {

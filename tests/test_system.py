@@ -7,8 +7,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from support.paths import REPOSITORY
 
-SCRIPT = Path(__file__).parents[1] / "scripts/system.sh"
+SCRIPT = REPOSITORY / "scripts/system.sh"
 APT = "env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends"
 MIRROR = " 500 http://mirror.test/debian bookworm/main amd64 Packages"
 

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vecenv.contract import BatchEnv
-    from vecenv.physics.budgets import Budget
+    from vecenv.libero.physics.budgets import Budget
+    from vecenv.libero.render.options import RenderConfig
     from vecenv.protocols import Protocol, ResetLoop
-    from vecenv.render.options import RenderConfig
     from vecenv.simpler.variants import Variant
 
 __version__ = "0.1.0"
@@ -193,7 +193,7 @@ def _simpler_metadata(suite: str, protocol: Protocol) -> dict[str, Any]:
     metadata = simpler_tasks.eval_metadata(suite)
     if protocol.episodes is not None:
         return metadata
-    from vecenv.simpler import published
+    from vecenv.simpler.published import lists as published
 
     counts = published.counts(protocol.name, suite)
     per_task = tuple(counts.get(index, 0) for index in range(metadata["num_tasks"]))
@@ -209,7 +209,7 @@ def list_suites(family: str | None = None) -> tuple[str, ...]:
     Raises:
         OptionError: another family.
     """
-    from vecenv.libero import suites
+    from vecenv.libero.tasks import suites
     from vecenv.simpler.tasks import SUITES
 
     known = {"libero": suites.list_suites(), _SIMPLER: SUITES}
@@ -224,7 +224,7 @@ def list_tasks(suite: str) -> tuple[Any, ...]:
     """The tasks of a suite in upstream's order, each with an ``index``, a ``name`` and an ``instruction``.
 
     Returns:
-        ``vecenv.libero.suites.TaskSpec`` or ``vecenv.simpler.tasks.SimplerTask``, by the suite.
+        ``vecenv.libero.tasks.suites.TaskSpec`` or ``vecenv.simpler.tasks.SimplerTask``, by the suite.
 
     Raises:
         KeyError: a subclass that lists the suites there are.
@@ -233,7 +233,7 @@ def list_tasks(suite: str) -> tuple[Any, ...]:
         from vecenv.simpler import tasks
 
         return tasks.list_tasks(suite)
-    from vecenv.libero import suites
+    from vecenv.libero.tasks import suites
 
     return suites.list_tasks(suite)
 
@@ -254,7 +254,7 @@ def eval_metadata(suite: str, protocol: str = "seed") -> dict[str, Any]:
     chosen = protocols.protocol(protocol, family(suite))
     if family(suite) == _SIMPLER:
         return {**_simpler_metadata(suite, chosen), "protocol": chosen.to_dict()}
-    from vecenv.libero import suites
+    from vecenv.libero.tasks import suites
 
     tasks = suites.list_tasks(suite)
     episodes = chosen.episodes or suites.NUM_EPISODES

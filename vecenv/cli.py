@@ -121,13 +121,13 @@ def compile_command(
     from rich.progress import track
 
     import vecenv
-    from vecenv.libero.bddl import BDDLError
-    from vecenv.libero.contacts import CONTACTS
-    from vecenv.libero.export import ExportError, export
-    from vecenv.libero.geometry import PROFILES
-    from vecenv.libero.scene import SceneError
-    from vecenv.libero.settled import SettledStartsError
-    from vecenv.libero.suites import TaskDataError
+    from vecenv.libero.scene.bddl import BDDLError
+    from vecenv.libero.scene.contacts import CONTACTS
+    from vecenv.libero.scene.lean.geometry import PROFILES
+    from vecenv.libero.scene.scene import SceneError
+    from vecenv.libero.tasks.export import ExportError, export
+    from vecenv.libero.tasks.settled import SettledStartsError
+    from vecenv.libero.tasks.suites import TaskDataError
 
     for name in suite:
         if name not in vecenv.list_suites("libero"):

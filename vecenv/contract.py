@@ -353,7 +353,7 @@ class ObjectsSnapshot:
         workspace: lower and upper corner of the workspace, [2, 3].
         targets: names the task is about (``obj_of_interest``).
         movable: the names that are not fixed to the world.
-        parts: name -> part of one of them; LIBERO's are named as ``vecenv.libero.parts`` says.
+        parts: name -> part of one of them; LIBERO's are named as ``vecenv.libero.scene.parts`` says.
     """
 
     names: tuple[str, ...]

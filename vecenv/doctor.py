@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from vecenv.machine import usable_cores
+from vecenv.util.cores import usable_cores
 
 DISTRIBUTION = "vecenv"
 # What installs the system's libraries from a clone.
@@ -328,7 +328,8 @@ def _gl_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
 
 
 def _images_check(gl: dict[str, Check]) -> Check:
-    """What camera images are drawn with: what ``MUJOCO_GL`` says, else the first that works (``vecenv.render.gl``)."""
+    """What camera images are drawn with: what ``MUJOCO_GL`` says, else the first that works
+    (``vecenv.libero.render.gl``)."""
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
     working = [name for name, check in gl.items() if check.ok]
     chosen = asked if asked in gl else working[0] if working else ""

@@ -1,6 +1,6 @@
 """The method as a whole, for a batch: language in, subtask after subtask planned on fresh ground truth and followed.
 
-An environment that speaks ``vecenv.contract`` and an :class:`~voxposer.llm.Llm` come in. Each round
+An environment that speaks ``vecenv.contract`` and an :class:`~voxposer.language.llm.Llm` come in. Each round
 (:meth:`Agent.step`) every slot that has a subtask left plans it on one frozen snapshot: the composer's program asks for
 motions, the planner turns all slots' value maps into paths in one call, and one ``env.step_waypoints`` follows all
 plans. Things that shall move themselves are pushed: look, find the best push, push, look again. A slot whose program
@@ -15,19 +15,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control, ObjectsSnapshot, PlanControl
-from voxposer import plan as plans
+from vecenv.manipulation.routes import RouteConfig, Stop, travel_route, work_route
+from vecenv.manipulation.world import matrix
 from voxposer import pushing
-from voxposer.guard import HostFault
 from voxposer.interface import Interface, InterfaceError, Request
-from voxposer.llm import Llm
-from voxposer.lmp import Lmps, build_lmps, run_planner
+from voxposer.language.llm import Llm
+from voxposer.language.lmp import Lmps, build_lmps, run_planner
 from voxposer.perception import Hand, Perception, PerceptionConfig, PerceptionError, quaternion
-from voxposer.plan import PlanConfig, Row
-from voxposer.planner import PlannerConfig
+from voxposer.planning import plan as plans
+from voxposer.planning.plan import PlanConfig, Row
+from voxposer.planning.planner import PlannerConfig
 from voxposer.pushing import PushError, Pushing, PushingConfig, Sight
-from voxposer.route import RouteConfig, Stop, travel_route, work_route
+from voxposer.sandbox.guard import HostFault
 from voxposer.steps import plan_paths, touches
-from voxposer.world import matrix
 
 # The end of a path begins this many voxels before it: a grip that changes here changes at the end.
 _END = 3.0

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from vecenv.manipulation.world import matrix
 from voxposer.perception import EE_ALIASES, Detected, Perception, quaternion
-from voxposer.world import matrix
 
 # A gripper map's rare value takes over the last waypoint from this many voxels away, as upstream's does.
 _GRIP_REACH = 3.0

@@ -1,9 +1,9 @@
 """What programs can see: every nameable thing of one frozen snapshot, as voxels, with how to grasp it and where to put.
 
 One slot's :class:`~vecenv.contract.ObjectsSnapshot` and the :class:`Hand` come in; :meth:`Perception.detect` gives
-observations by name. Names are the task's things, their parts (``vecenv.libero.parts`` says how they are named), and a
-few aliases for the hand, the table and whatever is held. Nothing else of the task is read: no goal, no regions of the
-goal, no object of interest. All of it is geometry on true surface points; grasps and places are worked out when a
+observations by name. Names are the task's things, their parts (``vecenv.libero.scene.parts`` says how they are named),
+and a few aliases for the hand, the table and whatever is held. Nothing else of the task is read: no goal, no regions of
+the goal, no object of interest. All of it is geometry on true surface points; grasps and places are worked out when a
 program asks for them, once a snapshot. A snapshot is frozen: its arrays refuse to be written.
 """
 
@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from vecenv.contract import ObjectsSnapshot, Part, PointCloud, RegionBox
-from voxposer import maps
-from voxposer.grasps import Grasps, Gripper, clearance, room_around
-from voxposer.lmp import Observation
-from voxposer.placing import Target, choose_grasp, put_down
-from voxposer.world import Margins, World, down_facing, matrix, pinching, spun, tilted, upright, yaw
+from vecenv.manipulation.grasps import Grasps, Gripper, clearance, room_around
+from vecenv.manipulation.placing import Target, choose_grasp, put_down
+from vecenv.manipulation.world import Margins, World, down_facing, matrix, pinching, spun, tilted, upright, yaw
+from voxposer.language.lmp import Observation
+from voxposer.planning import maps
 
 MAP_SIZE = 100
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
+from vecenv.manipulation.routes import Stop
 from voxposer.perception import Perception
-from voxposer.push import Push, PushConfig, best_push, push_waypoints
-from voxposer.route import Stop
+from voxposer.planning.push import Push, PushConfig, best_push, push_waypoints
 
 # Pushes searched for at once: one shape, one compilation.
 CHUNK = 8

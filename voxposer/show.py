@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from voxposer.agent import Agent, AgentConfig, Planned
-from voxposer.llm import Llm, LlmConfig
-from voxposer.lmp import Call
+from voxposer.language.llm import Llm, LlmConfig
+from voxposer.language.lmp import Call
 from voxposer.steps import obstacle_map
 
 # Voxels of an obstacle map above this are drawn, and no more than that many.

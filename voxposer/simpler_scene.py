@@ -28,12 +28,12 @@ from vecenv.contract import (
     PointCloud,
     ResetInfo,
 )
+from vecenv.manipulation.grasps import Gripper
+from vecenv.manipulation.routes import RouteConfig
+from vecenv.manipulation.world import Margins, matrix
 from voxposer.agent import AgentConfig
-from voxposer.grasps import Gripper
 from voxposer.perception import PerceptionConfig, quaternion
-from voxposer.plan import Plan, PlanConfig
-from voxposer.route import RouteConfig
-from voxposer.world import Margins, matrix
+from voxposer.planning.plan import Plan, PlanConfig
 
 SUITE = "simpler/bridge"
 FAMILY = "simpler/"

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from voxposer import maps
+from vecenv.manipulation.routes import RouteConfig, works
 from voxposer.interface import Interface, InterfaceError, Request
 from voxposer.perception import Perception
-from voxposer.planner import Fault, PlannerConfig, optimize_paths
-from voxposer.route import RouteConfig, works
+from voxposer.planning import maps
+from voxposer.planning.planner import Fault, PlannerConfig, optimize_paths
 
 # Paths planned at once: few shapes to compile for, and a bound on memory (a float64 volume of a path is 8 MB).
 CHUNK = 8
@@ -63,7 +63,7 @@ def start_of(interface: Interface, request: Request) -> np.ndarray:
 
 
 def touches(perception: Perception, request: Request, config: RouteConfig) -> bool:
-    """Whether a motion is to push or pull (``voxposer.route.works``): then only the program's own map is in its way."""
+    """Whether a motion is to push or pull, as `works` says: then only the program's own map is in its way."""
     if request.targets is None or request.object_centric:
         return False
     here = perception.grid.voxel(perception.ee.pos)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from vecenv.controllers.rotations import require_tail
+from vecenv.util.rotations import require_tail
 
 
 @dataclass(frozen=True, kw_only=True)

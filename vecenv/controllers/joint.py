@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from vecenv.controllers.osc import OSC_POSE, ArmState
-from vecenv.controllers.rotations import require_tail
+from vecenv.util.rotations import require_tail
 
 
 @dataclass(frozen=True, kw_only=True)

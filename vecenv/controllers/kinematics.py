@@ -31,8 +31,8 @@ from jax.typing import ArrayLike
 
 from vecenv.controllers._batch_last import cross, fenced_on_cpu, stage, sum_rows
 from vecenv.controllers.osc import NUM_JOINTS, ArmState
-from vecenv.controllers.rotations import require_tail
-from vecenv.libero.scene import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, HAND_BODY
+from vecenv.libero.scene.scene import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, HAND_BODY
+from vecenv.util.rotations import require_tail
 
 NUM_FINGERS = 2
 NUM_BODIES = NUM_JOINTS + NUM_FINGERS

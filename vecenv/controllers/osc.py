@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from vecenv.controllers._batch_last import cross, fenced_on_cpu, stage, sum_rows
-from vecenv.controllers.rotations import matmul, require_tail, safe_norm
+from vecenv.util.rotations import matmul, require_tail, safe_norm
 
 NUM_JOINTS = 7
 # Below this squared ratio to its own length a Gram-Schmidt remainder is rounding; robosuite's pinv uses the same 1e-15.

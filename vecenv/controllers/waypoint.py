@@ -26,14 +26,7 @@ import jax
 import jax.numpy as jnp
 
 from vecenv.controllers.osc import OSC_POSE, OscConfig
-from vecenv.controllers.rotations import (
-    quat_mul,
-    quat_normalize,
-    require_tail,
-    rotation_between,
-    rotvec_to_quat,
-    safe_norm,
-)
+from vecenv.util.rotations import quat_mul, quat_normalize, require_tail, rotation_between, rotvec_to_quat, safe_norm
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,9 +30,9 @@ import vecenv
 from vecenv import placement
 from vecenv.contract import ACTION_DIM, Control
 from vecenv.libero.env import LiberoEnv
-from vecenv.libero.scene import Scene
-from vecenv.libero.suites import NUM_EPISODES, list_suites, list_tasks
-from vecenv.physics.base import Group
+from vecenv.libero.physics.base import Group
+from vecenv.libero.scene.scene import Scene
+from vecenv.libero.tasks.suites import NUM_EPISODES, list_suites, list_tasks
 
 __all__ = ["Env", "GymnasiumError", "VectorEnv", "env_ids", "make_vec", "register_envs"]
 

@@ -28,7 +28,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from vecenv.libero import functional
 from vecenv.libero.functional import FunctionalConfig, FunctionalError, randomize
-from vecenv.libero.suites import list_suites, list_tasks
+from vecenv.libero.tasks.suites import list_suites, list_tasks
 
 try:
     from ml_collections import config_dict

@@ -2,7 +2,7 @@
 
 A batch of slots, each with one episode of one task of a suite. Tasks of one scene share a compiled model and differ in
 their start states, goals and instructions, which are data. Read ``vecenv/contract.py`` for what the verbs promise and
-``vecenv/physics/native.py`` for what happens in a control step.
+``vecenv/libero/physics/native.py`` for what happens in a control step.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ from vecenv.contract import (
     State,
 )
 from vecenv.controllers import waypoint
-from vecenv.libero import fixtures as fixture_poses
-from vecenv.libero import goals, settling, surface
-from vecenv.libero import settled as settled_starts
-from vecenv.libero.bddl import Problem, SceneKey
-from vecenv.libero.contacts import CONTACTS, Contacts
-from vecenv.libero.export import exported_tasks
-from vecenv.libero.geometry import PROFILES
-from vecenv.libero.parts import PartSpec, opening, scene_parts
-from vecenv.libero.scene import Scene
-from vecenv.libero.sources import Task, installed_tasks
-from vecenv.libero.suites import NUM_EPISODES
-from vecenv.physics import budgets
-from vecenv.physics.base import SETTLE_ACTION, SETTLE_TICKS, Group, Physics, Start
-from vecenv.physics.budgets import Budget
-from vecenv.physics.build import BACKENDS, make_physics
+from vecenv.libero.physics import budgets, settling
+from vecenv.libero.physics.base import SETTLE_ACTION, SETTLE_TICKS, Group, Physics, Start
+from vecenv.libero.physics.budgets import Budget
+from vecenv.libero.physics.build import BACKENDS, make_physics
+from vecenv.libero.render.cameras import Eyes, options_of
+from vecenv.libero.render.options import RenderConfig, VisualOptions
+from vecenv.libero.scene import goals, surface
+from vecenv.libero.scene.bddl import Problem, SceneKey
+from vecenv.libero.scene.contacts import CONTACTS, Contacts
+from vecenv.libero.scene.lean.geometry import PROFILES
+from vecenv.libero.scene.parts import PartSpec, opening, scene_parts
+from vecenv.libero.scene.scene import Scene
+from vecenv.libero.tasks import fixtures as fixture_poses
+from vecenv.libero.tasks import settled as settled_starts
+from vecenv.libero.tasks.export import exported_tasks
+from vecenv.libero.tasks.sources import Task, installed_tasks
+from vecenv.libero.tasks.suites import NUM_EPISODES
 from vecenv.protocols import DEFAULT, Protocol, ResetLoop, reset_loop
-from vecenv.render.eyes import Eyes, options_of
-from vecenv.render.options import RenderConfig, VisualOptions
 from vecenv.slots import SlotBatch
 
 MAX_STEPS = 2500
@@ -70,15 +70,16 @@ class LiberoConfig:
         protocol: name of the evaluation protocol that the options come from, for the record; it decides nothing here.
         backend: ``"native"`` (MuJoCo on CPU threads, float64), ``"warp"`` (MJX on MuJoCo Warp: NVIDIA GPUs, or a CPU),
             ``"jax"`` (MJX in pure JAX: any device), or ``"mjx"`` (warp on CUDA, jax elsewhere).
-        geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, fitted ones (``vecenv.libero.geometry``).
+        geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, fitted ones
+        (``vecenv.libero.scene.lean.geometry``).
         contacts: ``"published"``, those of the MuJoCo that LIBERO's data and checkpoints come from, or ``"current"``,
-            those of the installed one (``vecenv.libero.contacts``).
+            those of the installed one (``vecenv.libero.scene.contacts``).
         budget: contact and constraint memory on MJX; None measures the scene once and remembers it.
         fixtures: ``"center"`` (of the BDDL region), ``"sampled"`` (per episode), ``"upstream"`` (as upstream draws them
             in ``reset_loop``), or name -> (pos [3] or [B, 3] in metres, quat wxyz [4] or [B, 4]), world frame.
         start: ``"settled"``, the stored init states after ten idle ticks: under MuJoCo 3.3.0, shipped with the package,
-            for fixtures at the centre; settled here, once, for fixtures elsewhere (``vecenv.libero.settling``). Or
-            ``"raw"``, the stored init states followed by ``settle_steps``.
+            for fixtures at the centre; settled here, once, for fixtures elsewhere (``vecenv.libero.physics.settling``).
+            Or ``"raw"``, the stored init states followed by ``settle_steps``.
         settle_steps: for ``start="raw"``: control ticks with no motion and an opening gripper before an episode begins;
             they do not count.
         max_steps: step budget of an episode in control ticks.

@@ -21,28 +21,20 @@ import numpy as np
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
-from vecenv.contract import (
-    FIRST,
-    SUCCESS_MODES,
-    CameraView,
-    Control,
-    Egocentric,
-    Objects,
-    Rendered,
-    State,
-)
+from vecenv.contract import FIRST, SUCCESS_MODES, CameraView, Control, Egocentric, Objects, Rendered, State
 from vecenv.controllers.waypoint import Plan
-from vecenv.simpler import assets, kinematics, robots
+from vecenv.simpler.assets import files as assets
+from vecenv.simpler.control import kinematics, robots
+from vecenv.simpler.control.kinematics import rotation_from_quat
+from vecenv.simpler.control.servo import Servo, ServoConfig
 from vecenv.simpler.episodes import Episode, prepare, require_drawable
 from vecenv.simpler.judge import Judge, Verdict
-from vecenv.simpler.kinematics import rotation_from_quat
-from vecenv.simpler.published import SEED, EpisodeSpec, check_placement, check_protocol, counts, place, scene_of
-from vecenv.simpler.published import episodes as published_episodes
-from vecenv.simpler.scenes import instances
-from vecenv.simpler.servo import Servo, ServoConfig
+from vecenv.simpler.physics.scenes import instances
+from vecenv.simpler.physics.workers import Job, Sizes, Slots, make_slots
+from vecenv.simpler.published.lists import SEED, EpisodeSpec, check_placement, check_protocol, counts, place, scene_of
+from vecenv.simpler.published.lists import episodes as published_episodes
 from vecenv.simpler.tasks import find_task, list_tasks
 from vecenv.simpler.variants import Variant, make_variant, varied
-from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
 if TYPE_CHECKING:

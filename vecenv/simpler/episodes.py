@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from vecenv.assets import AssetsMissing
-from vecenv.simpler import assets
+from vecenv.simpler.assets import files as assets
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, LinkMaterial, Robot
 from vecenv.simpler.judge import Roles
 from vecenv.simpler.layouts import Layout, Placed
-from vecenv.simpler.robots import GOOGLE_ROBOT, LinkMaterial, Robot
-from vecenv.simpler.scenes import (
+from vecenv.simpler.physics.scenes import (
     GOOGLE_FINGER_ARMATURE,
     GOOGLE_FINGER_STOP,
     Box,
@@ -29,9 +29,9 @@ from vecenv.simpler.scenes import (
     Stage,
     Start,
 )
+from vecenv.simpler.physics.weld import LinkSurface
 from vecenv.simpler.tasks import BRIDGE, DRAWERS, ModelInfo, SimplerTask, read_models
 from vecenv.simpler.variants import station_meshes
-from vecenv.simpler.weld import LinkSurface
 
 # The cabinet's place in the world.
 CABINET_POSE = (-0.295, 0.0, 0.017, 1.0, 0.0, 0.0, 0.0)

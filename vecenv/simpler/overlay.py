@@ -25,7 +25,7 @@ import sapien
 from PIL import Image
 
 from vecenv.simpler.episodes import Episode, drawn_stage, require_drawable
-from vecenv.simpler.scenes import CABINET, ROBOT, Scene, SceneSpec, instances
+from vecenv.simpler.physics.scenes import CABINET, ROBOT, Scene, SceneSpec, instances
 from vecenv.simpler.tasks import Camera, Lighting
 
 # What upstream gives robots and, in one task, objects.

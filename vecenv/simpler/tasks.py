@@ -20,7 +20,7 @@ from typing import Any, SupportsIndex
 
 import numpy as np
 
-from vecenv.simpler.robots import GOOGLE_ROBOT, WIDOWX, Robot
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX, Robot
 
 BRIDGE, GOOGLE = "simpler/bridge", "simpler/google_robot"
 SUITES: tuple[str, ...] = (BRIDGE, GOOGLE)
@@ -665,7 +665,7 @@ def eval_metadata(suite: str, protocol: str = "seed") -> dict[str, Any]:
         UnknownSuite: no such suite.
         PublishedError: no such protocol, or it has no episodes of this suite.
     """
-    from vecenv.simpler import published  # it builds on this module
+    from vecenv.simpler.published import lists as published  # it builds on this module
 
     tasks, there = list_tasks(suite), published.counts(protocol, suite)
     counts = tuple(there.get(task.index, 0) for task in tasks)

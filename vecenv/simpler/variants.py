@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from vecenv.assets import AssetsMissing
-from vecenv.simpler.assets import NAME, how_to_get
+from vecenv.simpler.assets.files import NAME, how_to_get
 from vecenv.simpler.layouts import Layout, Placed
 from vecenv.simpler.tasks import DATA, DirectionalLight, Lighting, SimplerTask, Stage
 

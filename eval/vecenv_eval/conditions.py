@@ -1,0 +1,100 @@
+"""What an evaluation ran under, so that two success rates can be told apart: protocol, horizon, start, contacts, ...
+
+An environment comes in; a plain mapping for ``config.json`` and ``summary.json`` goes out, and from it the sentence
+that reports and tables carry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from vecenv import family, protocols
+
+if TYPE_CHECKING:
+    from vecenv.contract import BatchEnv
+    from vecenv_eval.runner import EvalConfig
+
+# What a family has no choice of.
+NONE = "-"
+
+
+def conditions(env: BatchEnv, config: EvalConfig) -> dict[str, Any]:
+    """What episodes in an environment run under.
+
+    Args:
+        env: the environment, whose own configuration is what counts.
+        config: what was asked for, for environments that do not say.
+
+    Returns:
+        Plain types: ``protocol``; ``instead``, options that are not the protocol's, name -> [the protocol's, the one in
+        use]; ``horizon`` in ticks, ``idle_steps``, ``start``, ``contacts``, ``colors``, ``fixtures``, ``reset_loop``
+        (of upstream's fixtures), ``seed`` and ``success``. ``"-"`` stands where the suite has no such choice.
+    """
+    chosen = protocols.protocol(config.protocol, family(config.suite))
+    options = {name: getattr(getattr(env, "config", None), name, None) for name in chosen.options(config.suite)}
+    used = chosen.options(config.suite) | {name: value for name, value in options.items() if value is not None}
+    if chosen.family == protocols.SIMPLER:
+        return _simpler(env, chosen, used)
+    upstream = used["fixtures"] == "upstream"
+    instead = chosen.departures(config.suite, used)
+    return {
+        "protocol": chosen.name,
+        "instead": {name: [_plain(value) for value in pair] for name, pair in instead.items()},
+        "horizon": used["max_steps"],
+        "idle_steps": used["settle_steps"] if used["start"] == "raw" else 0,
+        "start": used["start"],
+        "contacts": _of(env, "contacts"),
+        "colors": _of(env, "render", "colors"),
+        "fixtures": _plain(used["fixtures"]),
+        "reset_loop": asdict(protocols.reset_loop(used["reset_loop"])) if upstream else NONE,
+        "seed": used["seed"],
+        "success": used["success"],
+    }
+
+
+def _simpler(env: BatchEnv, chosen: protocols.Protocol, used: Mapping[str, Any]) -> dict[str, Any]:
+    most = _of(env, "max_steps")
+    return {
+        "protocol": chosen.name,
+        "instead": {} if used["success"] == chosen.success else {"success": [chosen.success, used["success"]]},
+        "horizon": "each task's own" if most in (None, NONE) else most,
+        **dict.fromkeys(("idle_steps", "start", "contacts", "colors", "fixtures", "reset_loop"), NONE),
+        "seed": "2022 to 2071" if chosen.name == protocols.DEFAULT else "the published lists'",
+        "success": used["success"],
+    }
+
+
+def describe(conditions: Mapping[str, Any]) -> str:
+    """The conditions in a sentence; "" for none."""
+    if not conditions:
+        return ""
+    instead = [f"{name} {ours} -> {used}" for name, (ours, used) in conditions["instead"].items()]
+    idle = f" and {conditions['idle_steps']} idle ticks" if conditions["idle_steps"] not in (0, NONE) else ""
+    parts = {
+        "protocol": conditions["protocol"] + (f" (but {', '.join(instead)})" if instead else ""),
+        "horizon": conditions["horizon"],
+        "success": conditions["success"],
+        "start": f"{conditions['start']}{idle}",
+        "contacts": conditions["contacts"],
+        "colours": conditions["colors"],
+        "fixtures": conditions["fixtures"],
+        "seed": conditions["seed"],
+    }
+    return "; ".join(f"{name} {value}" for name, value in parts.items()) + "."
+
+
+def _of(env: BatchEnv, *path: str) -> Any:
+    """An attribute of an environment's configuration; ``"-"`` where it has no such choice."""
+    value: Any = getattr(env, "config", None)
+    for name in path:
+        value = getattr(value, name, NONE)
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """An option as JSON and a reader see it."""
+    if isinstance(value, protocols.ResetLoop):
+        return asdict(value)
+    return f"given for {', '.join(sorted(value))}" if isinstance(value, Mapping) else value

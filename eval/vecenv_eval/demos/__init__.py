@@ -1,0 +1,1 @@
+"""Recording episodes as LIBERO's HDF5 demonstrations, and replaying them."""

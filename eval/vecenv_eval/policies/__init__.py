@@ -1,0 +1,112 @@
+"""Policies: what the harness asks of one, and how a name becomes one.
+
+A name comes in (``"zero"``, or ``"my_module:MyPolicy"`` for the user's own), a :class:`Policy` goes out. A policy acts
+for the whole batch at once and sees the environment through its public verbs only.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from vecenv.contract import BatchEnv, Control, ResetInfo
+
+BUILTIN = {
+    "pick_place": "vecenv_eval.policies.pick_place:PickPlacePolicy",
+    "random": "vecenv_eval.policies.random:RandomPolicy",
+    "simpler_scripted": "vecenv_eval.policies.simpler_scripted:SimplerScriptedPolicy",
+    "voxposer": "vecenv_eval.policies.voxposer:VoxPoserPolicy",
+    "zero": "vecenv_eval.policies.scripted:ZeroPolicy",
+}
+
+
+class PolicyError(ValueError):
+    """A policy cannot be made: unknown name, a module that does not import, or arguments it does not take."""
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """What the harness asks of a policy.
+
+    Attributes:
+        name: how the policy is called in results.
+    """
+
+    name: str
+
+    def reset(self, env: BatchEnv, info: ResetInfo) -> None:
+        """Begin with a freshly placed batch; called once after each ``env.reset()``."""
+        ...
+
+    def act(self, env: BatchEnv) -> np.ndarray | Control:
+        """Decide what every slot does next.
+
+        Returns:
+            Actions for ``step_continuous``, [B, 7] or a chunk [B, K, 7] (rows of finished slots are ignored); or, from
+            a policy that stepped the environment itself (say with ``step_ee_pose``), the ``Control`` it got.
+        """
+        ...
+
+
+@runtime_checkable
+class Reporting(Protocol):
+    """A policy that has something to say about each episode beyond the verdict; optional."""
+
+    def extras(self, slot: int) -> Mapping[str, Any]:
+        """Numbers and words about the episode in a slot, which has just finished; they go into its record."""
+        ...
+
+
+def extras_of(policy: Policy, slot: int) -> dict[str, Any]:
+    """What a policy reports about the episode in a slot; nothing if it reports nothing."""
+    return dict(policy.extras(slot)) if isinstance(policy, Reporting) else {}
+
+
+def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
+    """Make the policy called ``name``.
+
+    Args:
+        name: one of ``BUILTIN``, or ``"module:Class"``.
+        seed: passed on to policies whose constructor takes a ``seed`` (unless ``arguments`` already has one).
+        **arguments: constructor arguments.
+
+    Raises:
+        PolicyError: the name is unknown, its module does not import, or it does not take the arguments.
+    """
+    factory = _load(name)
+    parameters = inspect.signature(factory).parameters
+    if "seed" in parameters:
+        arguments = {"seed": seed, **arguments}
+    try:
+        inspect.signature(factory).bind(**arguments)
+    except TypeError as error:
+        takes = ", ".join(parameters) or "none"
+        raise PolicyError(f"policy {name!r}: {error}; arguments it takes: {takes}") from None
+    policy = factory(**arguments)
+    if not isinstance(policy, Policy):
+        raise PolicyError(f"policy {name!r} is not a policy: it needs a name, reset(env, info) and act(env)")
+    return policy
+
+
+def _load(name: str) -> Any:
+    """The class or function that makes the policy."""
+    target = BUILTIN.get(name, name)
+    module_name, separator, attribute = target.partition(":")
+    if not (separator and module_name and attribute):
+        close = difflib.get_close_matches(name, BUILTIN, n=1) or sorted(BUILTIN)
+        raise PolicyError(f"unknown policy {name!r}: did you mean {', '.join(close)}? Your own go by 'module:Class'")
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        raise PolicyError(
+            f"policy {name!r}: importing {module_name!r} failed: {type(error).__name__}: {error}"
+        ) from error
+    factory = getattr(module, attribute, None)
+    if not callable(factory):
+        raise PolicyError(f"policy {name!r}: the module {module_name!r} has no class {attribute!r}")
+    return factory

@@ -1,0 +1,175 @@
+"""Grids of images, and videos of them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from vecenv_eval.film import GAP, TITLE_HEIGHT, VideoWriter, recording, render_grid
+
+from vecenv.libero.render.options import RenderError
+
+IMAGES = np.arange(5, dtype=np.uint8)[:, None, None, None] * np.full((1, 20, 30, 3), 50, np.uint8)
+
+
+def inner(grid: np.ndarray, row: int, column: int, head: int = 0) -> np.ndarray:
+    height, width = 20 + head + 2 * GAP, 30 + 2 * GAP
+    tile = grid[row * height : (row + 1) * height, column * width : (column + 1) * width]
+    return tile[GAP + head : -GAP, GAP:-GAP]
+
+
+def test_images_stand_in_rows() -> None:
+    grid = render_grid(IMAGES, columns=3)
+    assert grid.shape == (2 * (20 + 2 * GAP), 3 * (30 + 2 * GAP), 3)
+    for index in range(5):
+        np.testing.assert_array_equal(inner(grid, *divmod(index, 3)), IMAGES[index])
+
+
+def test_cameras_stand_side_by_side() -> None:
+    grid = render_grid([IMAGES[:1], IMAGES[1:2]])
+    np.testing.assert_array_equal(grid[GAP:-GAP, GAP:-GAP], np.concatenate([IMAGES[0], IMAGES[1]], axis=1))
+
+
+def test_titles_stand_above_and_leave_the_images_alone() -> None:
+    pytest.importorskip("PIL")
+    grid = render_grid(IMAGES[:1], ["soup"])
+    np.testing.assert_array_equal(inner(grid, 0, 0, TITLE_HEIGHT), IMAGES[0])
+    assert (grid[:TITLE_HEIGHT].max(axis=-1) > 200).any()
+
+
+def test_long_titles_take_up_to_three_lines_in_every_tile() -> None:
+    pytest.importorskip("PIL")
+    grid = render_grid(IMAGES[:2], ["soup", "pick up the soup and place it in the basket"], columns=2)
+    assert grid.shape[0] == 20 + 3 * TITLE_HEIGHT + 2 * GAP
+    for column in range(2):
+        np.testing.assert_array_equal(inner(grid, 0, column, 3 * TITLE_HEIGHT), IMAGES[column])
+
+
+def test_titles_say_the_verdict_in_its_colour() -> None:
+    pytest.importorskip("PIL")
+    images = np.zeros((3, 20, 120, 3), np.uint8)
+    grid = render_grid(images, ["soup"] * 3, columns=1, verdicts=[True, False, None]).astype(int)
+    heads = grid.reshape(3, -1, grid.shape[1], 3)[:, GAP : GAP + TITLE_HEIGHT, GAP:-GAP]
+    greener, redder = heads[..., 1] - heads[..., 0], heads[..., 0] - heads[..., 1]
+    assert [int(head.max()) > 60 for head in greener] == [True, False, False]
+    assert [int(head.max()) > 60 for head in redder] == [False, True, False]
+
+
+def test_verdicts_frame_a_slot() -> None:
+    solved, failed, open_ = (tuple(render_grid(IMAGES[:1], verdicts=[v])[0, 0]) for v in (True, False, None))
+    assert solved[1] > solved[0]
+    assert failed[0] > failed[1]
+    assert max(open_) < 50
+
+
+@pytest.mark.parametrize(
+    ("images", "options", "message"),
+    [
+        (IMAGES[:0], {}, "no image"),
+        (IMAGES.astype(float), {}, "uint8"),
+        (IMAGES[0], {}, "uint8"),
+        (IMAGES, {"titles": ["one"]}, "1 titles for 5 images"),
+        (IMAGES, {"verdicts": [True]}, "1 verdicts for 5 images"),
+        (IMAGES, {"columns": 0}, "columns=0"),
+    ],
+)
+def test_what_cannot_be_tiled_is_refused(images: Any, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(RenderError, match=message):
+        render_grid(images, **options)
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    imageio = pytest.importorskip("imageio")
+    return list(imageio.get_reader(path).iter_data())
+
+
+def test_a_video_has_its_frames(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / "new" / "episode.mp4"
+    with VideoWriter(path) as writer:
+        for shade in (0, 60, 120, 180, 240):
+            writer.add(np.full((47, 65, 3), shade, np.uint8))
+    frames = frames_of(path)
+    assert [round(float(frame.mean()) / 60) for frame in frames] == [0, 1, 2, 3, 4]
+    assert frames[0].shape == (48, 66, 3)
+
+
+def test_videos_are_mp4(tmp_path: Path) -> None:
+    with pytest.raises(RenderError, match=r"written as \.mp4"):
+        VideoWriter(tmp_path / "episode.avi")
+
+
+def test_without_ffmpeg_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "imageio", None)
+    with pytest.raises(RenderError, match=r"vecenv\[render\]"):
+        VideoWriter(tmp_path / "episode.mp4").add(IMAGES[0])
+
+
+class Countdown:
+    """Two slots: the first is solved after two ticks, the second never."""
+
+    def __init__(self) -> None:
+        self.ticks, self.watchers = 0, []
+
+    def reset(self) -> SimpleNamespace:
+        return SimpleNamespace(episode_id=("a/0/0", "a/0/1"), instruction=("do it", "do it"))
+
+    def observe_egocentric(self) -> SimpleNamespace:
+        return SimpleNamespace(images={"agentview": np.full((2, 32, 32, 3), 40 * self.ticks, np.uint8)})
+
+    def evaluate(self) -> SimpleNamespace:
+        return SimpleNamespace(success=np.array([self.ticks >= 2, False]))
+
+    @contextmanager
+    def watched(self, watcher: Any) -> Iterator[None]:
+        self.watchers.append(watcher)
+        yield
+        self.watchers.remove(watcher)
+
+    def step(self) -> None:
+        for watcher in self.watchers:
+            watcher(None, None)
+        self.ticks += 1
+
+
+def test_every_tick_of_a_batch_is_a_frame_and_the_last_shows_the_verdicts(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("PIL")
+    env = Countdown()
+    with recording(env, tmp_path / "batch.mp4"):
+        for _ in range(3):
+            env.step()
+    frames = frames_of(tmp_path / "batch.mp4")
+    assert len(frames) == 4
+    assert frames[0][1].max() < 60
+    green, red = frames[-1][1, 10], frames[-1][1, -10]
+    assert green[1] > green[0]
+    assert red[0] > red[1]
+
+
+@pytest.mark.parametrize("option", [{"size": 64}, {"lod": "fast"}])
+def test_simplers_images_have_one_size_and_detail(option: dict[str, Any]) -> None:
+    from vecenv_eval.video import _environment
+
+    with pytest.raises(ValueError, match=f"--{next(iter(option))}"):
+        _environment("simpler/bridge", "0", 1, option)
+
+
+def test_a_simpler_video_runs_at_its_robots_rate(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("PIL")
+    import imageio
+    from vecenv_eval.video import film
+
+    env: Any = Countdown()
+    env.robot = SimpleNamespace(control_hz=5)
+    env.step_continuous = lambda _: (env.step(), SimpleNamespace(done=np.array([env.ticks >= 6] * 2)))[1]
+    actor = SimpleNamespace(reset=lambda *_: None, act=lambda _: None)
+    assert film(env, actor, tmp_path / "simpler.mp4", ["agentview"]) == 7
+    assert imageio.get_reader(tmp_path / "simpler.mp4").get_meta_data()["fps"] == 5

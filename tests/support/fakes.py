@@ -1,0 +1,154 @@
+"""A small environment that keeps the contract without any physics, for tests of what is built on the verbs.
+
+Episode ``e`` of an even task solves itself after ``e + 2`` ticks; odd tasks run into their budget.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from vecenv_eval.episodes import Suite
+from vecenv_eval.runner import Simulator
+
+from vecenv.contract import Control, EePoseControl, Egocentric, Metrics, Objects, PlanControl, ResetInfo
+
+SUITE = "fake_suite"
+
+
+class FakeEnv:
+    """The verbs over a table of ticks: ``tasks`` times ``episodes`` slots."""
+
+    def __init__(
+        self,
+        tasks: Sequence[int],
+        episodes: Sequence[int],
+        *,
+        max_steps: int = 10,
+        faults: Mapping[tuple[int, int], str] | None = None,
+        raise_in: Mapping[int, BaseException] | None = None,
+    ) -> None:
+        self.tasks, self.episodes = [np.array(x) for x in zip(*((t, e) for t in tasks for e in episodes), strict=True)]
+        self.num_envs = len(self.tasks)
+        self.max_steps, self.faults, self.raise_in = max_steps, faults or {}, raise_in or {}
+        self.closed, self.placements = False, 1
+        self.actions: list[np.ndarray] = []
+        self._clear()
+
+    def _clear(self) -> None:
+        self.ticks = np.zeros(self.num_envs, int)
+        self.terminated, self.truncated = np.zeros((2, self.num_envs), bool)
+
+    def reset(self) -> ResetInfo:
+        pairs = list(zip(self.tasks.tolist(), self.episodes.tolist(), strict=True))
+        return ResetInfo(
+            instruction=tuple(f"do thing {task}" for task, _ in pairs),
+            episode_id=tuple(f"{SUITE}/{task}/{episode}" for task, episode in pairs),
+            suite=SUITE,
+            task_id=self.tasks,
+            max_steps=np.full(self.num_envs, self.max_steps),
+        )
+
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+        assert len(tasks) == len(episodes) == self.num_envs
+        self.tasks, self.episodes = np.array(tasks), np.array(episodes)
+        self.placements += 1
+        self._clear()
+
+    def step_continuous(self, actions: Any) -> Control:
+        actions = np.asarray(actions, float)
+        chunk = actions[:, None] if actions.ndim == 2 else actions
+        assert chunk.shape == (self.num_envs, chunk.shape[1], 7)
+        before = self.ticks.copy()
+        for k in range(chunk.shape[1]):
+            self.actions.append(chunk[:, k])
+            self._tick()
+        return Control(
+            reward=self.terminated.astype(float),
+            terminated=self.terminated.copy(),
+            truncated=self.truncated.copy(),
+            success=self.terminated.copy(),
+            step_index=self.ticks.copy(),
+            info={
+                "mended": np.zeros(self.num_envs, bool),
+                "fault": self._fault_names(),
+                "ticks": self.ticks - before,
+            },
+        )
+
+    def _tick(self) -> None:
+        live = ~(self.terminated | self.truncated)
+        self.ticks += live
+        for task, error in self.raise_in.items():
+            if (live & (self.tasks == task) & (self.ticks == 3)).any():
+                raise error
+        faulted = np.array([bool(name) for name in self._fault_names()])
+        self.terminated |= live & (self.tasks % 2 == 0) & (self.ticks >= self.episodes + 2) & ~faulted
+        self.truncated |= live & ~self.terminated & ((self.ticks >= self.max_steps) | faulted)
+
+    def _fault_names(self) -> tuple[str, ...]:
+        pairs = zip(self.tasks.tolist(), self.episodes.tolist(), strict=True)
+        return tuple(self.faults.get(pair, "") for pair in pairs)
+
+    def evaluate(self) -> Metrics:
+        return Metrics(
+            success=self.terminated.copy(),
+            num_steps=self.ticks.copy(),
+            suite=SUITE,
+            task_id=self.tasks,
+            cumulative_reward=self.terminated.astype(float),
+        )
+
+    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+        control = self.step_continuous(np.zeros((self.num_envs, 7)))
+        return EePoseControl(**vars(control), error=("",) * self.num_envs)
+
+    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
+        control = self.step_continuous(np.zeros((self.num_envs, 7)))
+        return PlanControl(**vars(control), error=("",) * self.num_envs)
+
+    def observe_egocentric(self) -> Egocentric:
+        return Egocentric(state=np.zeros((self.num_envs, 8), np.float32))
+
+    def observe_objects(self, points: str = "surface") -> Objects:
+        return Objects(snapshot=(None,) * self.num_envs, error=("a fake has no objects",) * self.num_envs)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class FakeWorld:
+    """A suite of four tasks in two scenes (0 and 2, 1 and 3), five episodes each, and every environment made of it."""
+
+    def __init__(
+        self,
+        faults: Mapping[tuple[int, int], str] | None = None,
+        raise_in: Mapping[int, BaseException] | None = None,
+    ) -> None:
+        self.faults, self.raise_in = faults, raise_in
+        self.refuse: Exception | None = None
+        self.envs: list[FakeEnv] = []
+        self.suite = Suite(SUITE, tuple(f"do thing {t}" for t in range(4)), ("kitchen", "study") * 2, 5)
+
+    def make(
+        self,
+        suite: str,
+        *,
+        tasks: Sequence[int],
+        episodes: Sequence[int],
+        backend: str = "native",
+        seed: int = 0,
+        num_threads: int | None = None,
+        max_steps: int = 10,
+    ) -> FakeEnv:
+        assert suite == SUITE
+        if self.refuse:
+            raise self.refuse
+        del backend, seed, num_threads
+        self.envs.append(FakeEnv(tasks, episodes, max_steps=max_steps, faults=self.faults, raise_in=self.raise_in))
+        return self.envs[-1]
+
+    @property
+    def simulator(self) -> Simulator:
+        return Simulator(lambda name, protocol: self.suite, self.make)

@@ -1,0 +1,462 @@
+"""Questions to a language model, over HTTP to a server on this machine: answered, repeated, counted, kept."""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.llm_server import HANG, Answer, LlmServer, code, failure, serving
+
+pytest.importorskip("litellm", reason="the extra voxposer is not installed")
+
+from voxposer.language import llm as module
+from voxposer.language.llm import Llm, LlmConfig, LlmError, ReplyCache, ReplyError, Usage
+
+# Of a library that litellm uses.
+pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
+
+QUESTION = ({"role": "user", "content": "# Query: grasp the bowl."},)
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[LlmServer]:
+    with serving() as server:
+        yield server
+
+
+@pytest.fixture
+def server(running: LlmServer) -> LlmServer:
+    running.requests.clear()
+    running.say("pass")
+    return running
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of this test's own."""
+    monkeypatch.setenv(module.VARIABLE, str(tmp_path))
+    return tmp_path / "llm"
+
+
+@pytest.fixture
+def config(server: LlmServer, folder: Path) -> LlmConfig:
+    return LlmConfig(model="openai/local", api_base=server.base, api_key="secret", timeout_s=5, attempts=4, backoff_s=2)
+
+
+class Model(Llm):
+    """A model that notes its pauses in place of waiting."""
+
+    def __init__(self, config: LlmConfig) -> None:
+        self.pauses: list[float] = []
+        super().__init__(config, sleep=self.pauses.append)
+
+
+# The question and the answer
+
+
+def test_the_provider_gets_the_whole_request(server: LlmServer, config: LlmConfig) -> None:
+    Model(replace(config, options={"seed": 7})).complete(QUESTION, stop=("# Query: ",), max_tokens=99)
+    assert server.requests == [
+        {
+            "model": "local",
+            "messages": list(QUESTION),
+            "stop": ["# Query: "],
+            "max_tokens": 99,
+            "temperature": 0.0,
+            "seed": 7,
+        }
+    ]
+
+
+def test_an_answer_comes_with_its_tokens(server: LlmServer, config: LlmConfig) -> None:
+    server.say(code("  x = 1\n", prompt_tokens=30, completion_tokens=4))
+    reply = Model(config).complete(QUESTION)
+    assert (reply.text, reply.finish_reason, reply.model, reply.cached) == ("x = 1", "stop", "local", False)
+    assert (reply.prompt_tokens, reply.completion_tokens) == (30, 4)
+
+
+def test_an_answer_ends_at_the_first_stop_token_wherever_the_provider_stopped(
+    server: LlmServer, config: LlmConfig
+) -> None:
+    server.say("x = 1\nobjects = ['a']\n# Query: more.\ny = 2")
+    assert Model(config).complete(QUESTION, stop=("# Query: ", "objects =")).text == "x = 1"
+
+
+def test_a_known_model_has_a_price_and_an_unknown_one_none(server: LlmServer, config: LlmConfig) -> None:
+    server.say(code("pass", prompt_tokens=1000, completion_tokens=1000))
+    priced, unpriced = Model(replace(config, model="openai/gpt-4o")), Model(config)
+    assert (priced.complete(QUESTION).cost_usd or 0) > 0
+    assert unpriced.complete(QUESTION).cost_usd is None
+    assert (priced.usage.unpriced, unpriced.usage.unpriced) == (0, 1)
+    assert priced.usage.cost_usd > unpriced.usage.cost_usd == 0
+
+
+# Failures that pass
+
+
+PASSING = {
+    "429": failure(429, "slow down"),
+    "500": failure(500, "oops"),
+    "502": failure(502, "gateway"),
+    "503": failure(503, "busy"),
+    "408": failure(408, "too slow"),
+    "a page": Answer(body="<html>busy</html>"),
+    "half of a reply": Answer(body='{"choices": [{"mess'),
+    "another object": Answer(body={"hello": 1}),
+    "a list": Answer(body=[1, 2]),
+    "null": Answer(body="null"),
+}
+
+
+@pytest.mark.parametrize("answer", PASSING.values(), ids=PASSING)
+def test_a_failure_that_passes_is_waited_out(server: LlmServer, config: LlmConfig, answer: Answer) -> None:
+    server.say(answer, answer, "x = 1")
+    model = Model(config)
+    assert model.complete(QUESTION).text == "x = 1"
+    assert len(server.requests) == 3
+    assert model.usage == Usage(calls=1, retries=2, prompt_tokens=11, completion_tokens=7, unpriced=1)
+
+
+def test_pauses_double_and_have_a_bit_of_chance_in_them(server: LlmServer, config: LlmConfig) -> None:
+    server.say(failure(500, "oops"))
+    model = Model(config)
+    with pytest.raises(LlmError, match=r"openai/local: .*oops"):
+        model.complete(QUESTION)
+    assert len(server.requests) == config.attempts
+    assert [int(pause // 2) for pause in model.pauses] == [1, 2, 4]
+    assert all(0 <= pause - 2 * 2**i <= 1 for i, pause in enumerate(model.pauses))
+
+
+@pytest.mark.parametrize(("asked", "waited"), [("7", 7.0), ("0.5", 0.5), ("9999", 60.0), ("-3", 0.0)])
+def test_a_server_that_asks_for_a_pause_gets_it(
+    server: LlmServer, config: LlmConfig, asked: str, waited: float
+) -> None:
+    server.say(failure(429, "slow down", Retry_After=asked), "x = 1")
+    model = Model(config)
+    model.complete(QUESTION)
+    assert model.pauses == [waited]
+
+
+def test_a_server_may_ask_for_a_pause_until_a_date(server: LlmServer, config: LlmConfig) -> None:
+    then = format_datetime(datetime.now(UTC) + timedelta(seconds=40), usegmt=True)
+    server.say(failure(503, "busy", Retry_After=then), "x = 1")
+    model = Model(config)
+    model.complete(QUESTION)
+    assert 20 < model.pauses[0] <= 41
+
+
+def test_a_pause_that_makes_no_sense_is_ours(server: LlmServer, config: LlmConfig) -> None:
+    server.say(failure(429, "slow down", Retry_After="soon"), "x = 1")
+    model = Model(config)
+    model.complete(QUESTION)
+    assert 2 <= model.pauses[0] <= 3
+
+
+def test_a_server_that_does_not_answer_in_time_is_asked_again(server: LlmServer, config: LlmConfig) -> None:
+    server.say(HANG, "x = 1")
+    model = Model(replace(config, timeout_s=0.3))
+    assert model.complete(QUESTION).text == "x = 1"
+    assert model.usage.retries == 1
+
+
+def test_a_server_that_is_not_there_is_named_after_all_attempts(config: LlmConfig) -> None:
+    model = Model(replace(config, api_base="http://127.0.0.1:9/v1"))
+    with pytest.raises(LlmError, match="openai/local: ") as caught:
+        model.complete(QUESTION)
+    assert not isinstance(caught.value, ReplyError)
+    assert model.usage.retries == 3
+
+
+# Failures that stay
+
+
+@pytest.mark.parametrize("status", [400, 401, 403, 404])
+def test_a_refusal_is_told_at_once(server: LlmServer, config: LlmConfig, status: int) -> None:
+    server.say(failure(status, "no such key"))
+    model = Model(config)
+    with pytest.raises(LlmError, match="no such key") as caught:
+        model.complete(QUESTION)
+    assert len(server.requests) == 1
+    assert model.pauses == []
+    assert re.fullmatch(r"openai/local: \w+Error: no such key", str(caught.value))
+    assert "secret" not in str(caught.value)
+
+
+def test_an_answer_that_is_cut_off_is_an_error_that_says_what_to_raise(server: LlmServer, config: LlmConfig) -> None:
+    server.say(code("x = 1\ny = ", finish="length"))
+    model = Model(config)
+    with pytest.raises(ReplyError, match="openai/local: the answer is cut off at 512 tokens; raise max_tokens"):
+        model.complete(QUESTION)
+    assert model.usage.calls == 1
+
+
+@pytest.mark.parametrize("text", [None, "", "  \n ", "# Query: again"])
+def test_an_answer_without_a_word_is_an_error(server: LlmServer, config: LlmConfig, text: str | None) -> None:
+    server.say(code(text))
+    with pytest.raises(ReplyError, match="the answer is empty"):
+        Model(config).complete(QUESTION, stop=("# Query: ",))
+
+
+def test_a_response_without_choices_is_an_error(server: LlmServer, config: LlmConfig) -> None:
+    server.say(Answer(body={"id": "x", "object": "chat.completion", "created": 0, "model": "local", "choices": []}))
+    with pytest.raises(LlmError, match="no answer in it"):
+        Model(config).complete(QUESTION)
+
+
+def test_a_missing_key_is_told_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("OPENAI_API_KEY", "OPENAI_ADMIN_KEY"):
+        monkeypatch.delenv(name, raising=False)
+    model = Model(LlmConfig(model="gpt-4o"))
+    with pytest.raises(LlmError, match=r"gpt-4o: .*OPENAI_API_KEY"):
+        model.complete(QUESTION)
+    assert model.pauses == []
+
+
+def test_a_key_is_not_shown(config: LlmConfig) -> None:
+    assert "secret" not in repr(config)
+
+
+@pytest.mark.parametrize("wrong", [{"model": ""}, {"attempts": 0}, {"timeout_s": 0}, {"backoff_s": -1}])
+def test_a_config_that_cannot_work_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"model|attempts"):
+        LlmConfig(**wrong)
+
+
+# What is kept
+
+
+def test_the_same_question_is_asked_once(server: LlmServer, config: LlmConfig) -> None:
+    server.say("x = 1", "x = 2")
+    model = Model(config)
+    first, second = model.complete(QUESTION), model.complete(QUESTION)
+    assert (first.text, second.text, first.cached, second.cached) == ("x = 1", "x = 1", False, True)
+    assert len(server.requests) == 1
+    assert model.usage == Usage(calls=1, cached=1, prompt_tokens=11, completion_tokens=7, unpriced=1)
+
+
+def test_another_model_object_finds_what_was_kept(server: LlmServer, config: LlmConfig) -> None:
+    Model(config).complete(QUESTION)
+    reply = Model(config).complete(QUESTION)
+    assert (reply.cached, reply.prompt_tokens, len(server.requests)) == (True, 11, 1)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"max_tokens": 100},
+        {"temperature": 0.5},
+        {"stop": ("a",)},
+        {"messages": ({"role": "user", "content": "# Query: grasp the cup."},)},
+        {"messages": ({"role": "system", "content": "# Query: grasp the bowl."},)},
+    ],
+    ids=str,
+)
+def test_any_difference_in_a_request_is_another_question(
+    server: LlmServer, config: LlmConfig, other: dict[str, Any]
+) -> None:
+    model = Model(config)
+    model.complete(QUESTION)
+    assert not model.complete(other.pop("messages", QUESTION), **other).cached
+
+
+@pytest.mark.parametrize("other", [{"model": "openai/other"}, {"options": {"seed": 1}}], ids=str)
+def test_another_model_or_option_is_another_question(
+    server: LlmServer, config: LlmConfig, other: dict[str, Any]
+) -> None:
+    Model(config).complete(QUESTION)
+    assert not Model(replace(config, **other)).complete(QUESTION).cached
+
+
+def test_patience_and_key_are_no_part_of_the_question(server: LlmServer, config: LlmConfig) -> None:
+    Model(config).complete(QUESTION)
+    assert Model(replace(config, api_key="another", timeout_s=1, attempts=1)).complete(QUESTION).cached
+
+
+@pytest.mark.parametrize("answer", [code("x = 1", finish="length"), code("")], ids=["cut off", "empty"])
+def test_an_answer_that_cannot_be_used_is_not_kept(server: LlmServer, config: LlmConfig, answer: Answer) -> None:
+    server.say(answer, "x = 1")
+    model = Model(config)
+    with pytest.raises(ReplyError):
+        model.complete(QUESTION)
+    assert model.complete(QUESTION).text == "x = 1"
+
+
+def test_an_answer_that_fails_a_check_is_not_kept(server: LlmServer, config: LlmConfig) -> None:
+    def check(text: str) -> None:
+        compile(text, "", "exec")
+
+    server.say("Sure, here is the code!", "x = 1")
+    model = Model(config)
+    with pytest.raises(SyntaxError):
+        model.complete(QUESTION, check=check)
+    assert model.complete(QUESTION, check=check).text == "x = 1"
+
+
+def test_the_cache_can_be_turned_off(
+    server: LlmServer, config: LlmConfig, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = Model(replace(config, cache=False))
+    assert [model.complete(QUESTION).cached for _ in range(2)] == [False, False]
+    monkeypatch.setenv(module.VARIABLE, "")
+    Model(config).complete(QUESTION)
+    assert not folder.exists()
+
+
+def test_the_cache_can_be_somewhere_else(server: LlmServer, config: LlmConfig, folder: Path, tmp_path: Path) -> None:
+    Model(replace(config, cache=tmp_path / "mine")).complete(QUESTION)
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["replies.sqlite3"]
+    assert not folder.exists()
+
+
+def test_what_is_kept_is_json_and_says_what_was_asked_but_not_the_key(
+    server: LlmServer, config: LlmConfig, folder: Path
+) -> None:
+    Model(config).complete(QUESTION, stop=("b",))
+    with sqlite3.connect(folder / "replies.sqlite3") as connection:
+        ((request, reply),) = connection.execute("SELECT request, reply FROM replies").fetchall()
+    assert json.loads(request)["messages"] == list(QUESTION)
+    assert json.loads(reply)["text"] == "pass"
+    assert b"secret" not in (folder / "replies.sqlite3").read_bytes()
+
+
+@pytest.mark.parametrize("reply", ["{", "[]", '{"text": 1}', '"text"', b"\x80\x04]\x94."])
+def test_a_reply_that_someone_damaged_is_asked_for_again(
+    server: LlmServer, config: LlmConfig, folder: Path, reply: str | bytes
+) -> None:
+    Model(config).complete(QUESTION)
+    with sqlite3.connect(folder / "replies.sqlite3") as connection:
+        connection.execute("UPDATE replies SET reply = ?", (reply,))
+    assert not Model(config).complete(QUESTION).cached
+
+
+def test_a_file_that_is_no_cache_is_a_warning(server: LlmServer, config: LlmConfig, folder: Path) -> None:
+    folder.mkdir()
+    (folder / "replies.sqlite3").write_text("not a database, " * 100)
+    with pytest.warns(UserWarning, match=r"replies\.sqlite3: replies of language models are not kept"):
+        assert Model(config).complete(QUESTION).text == "pass"
+
+
+def test_a_folder_that_cannot_be_made_is_a_warning(server: LlmServer, config: LlmConfig, folder: Path) -> None:
+    folder.write_text("a file")
+    with pytest.warns(UserWarning, match="are not kept"):
+        assert Model(config).complete(QUESTION).text == "pass"
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from voxposer.language.llm import Reply, ReplyCache
+
+cache, name = ReplyCache(Path(sys.argv[1])), sys.argv[2]
+print("ready", flush=True)
+sys.stdin.readline()
+tokens = {"prompt_tokens": 1, "completion_tokens": 1, "cost_usd": None}
+for i in range(25):
+    reply = Reply(text=f"{name} {i}", model="m", finish_reason="stop", **tokens)
+    cache.put(f"shared {i}", {}, reply)
+    cache.put(f"{name} {i}", {}, reply)
+    assert cache.get(f"{name} {i}") == reply
+print(*(cache.get(f"shared {i}").text for i in range(25)), sep=",")
+"""
+
+
+def test_processes_that_write_at_once_lose_nothing_and_agree(tmp_path: Path) -> None:
+    command = [sys.executable, "-W", "error", "-c", WRITER, str(tmp_path)]
+    pipe = subprocess.PIPE
+    writers = [subprocess.Popen([*command, name], text=True, stdin=pipe, stdout=pipe, stderr=pipe) for name in "ab"]
+    for writer in writers:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "ready\n"
+    for writer in writers:
+        assert writer.stdin is not None
+        writer.stdin.write("go\n")
+        writer.stdin.flush()
+    said = [writer.communicate() for writer in writers]
+    assert [errors for _, errors in said] == ["", ""]
+    assert all(out.count(",") == 24 for out, _ in said)
+    cache = ReplyCache(tmp_path)
+    kept = [cache.get(f"{name} {i}") for name in "ab" for i in range(25)]
+    assert [reply.text for reply in kept if reply is not None] == [f"{name} {i}" for name in "ab" for i in range(25)]
+    final = [cache.get(f"shared {i}") for i in range(25)]
+    assert all(",".join(reply.text for reply in final if reply is not None) == out.strip() for out, _ in said)
+
+
+def test_threads_may_share_a_model(server: LlmServer, config: LlmConfig) -> None:
+    server.answer = lambda request: code(request["messages"][0]["content"])
+    model, barrier = Model(config), threading.Barrier(4)
+
+    def ask(thread: int) -> list[str]:
+        barrier.wait()
+        return [model.complete([{"role": "user", "content": f"x = {i}"}]).text for i in range(10)]
+
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(ask, range(4)))
+    assert answers == [[f"x = {i}" for i in range(10)]] * 4
+    assert model.usage.calls + model.usage.cached == 40
+    assert model.usage.calls == len(server.requests)
+
+
+# Libraries
+
+
+ALONE = """
+import os, socket, sys
+def refuse(*args): raise AssertionError(f"the network was used: {args}")
+from voxposer.language.llm import Llm
+assert "litellm" not in sys.modules
+socket.socket.connect = refuse
+before = dict(os.environ)
+from voxposer import llm
+llm._litellm()
+assert dict(os.environ) == before, set(os.environ) ^ set(before)
+"""
+
+
+def test_litellm_is_imported_late_without_network_env_files_or_a_word(tmp_path: Path) -> None:
+    (tmp_path / ".env").write_text("FROM_A_FILE=1\n")
+    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_a_missing_library_is_named_with_the_extra(config: LlmConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tenacity", None)
+    with pytest.raises(ImportError, match=r"tenacity: pip install 'vecenv\[voxposer\]'"):
+        Model(config).complete(QUESTION)
+
+
+# The offline writer
+
+
+def offline_question(query: str) -> list[dict[str, str]]:
+    task = "Queries are for `composer`.\n```\nmovable = parse_query_obj('gripper')\nexecute(movable)\n```"
+    return [{"role": "user", "content": task}, {"role": "user", "content": f"# Query: {query}."}]
+
+
+def test_the_default_model_needs_no_key_and_leaves_nothing_on_disk(folder: Path) -> None:
+    model = Llm()
+    first, second = (model.complete(offline_question("open gripper"), stop=("# Query: ",)) for _ in range(2))
+    assert model.config.model == "offline/libero"
+    assert "execute(" in first.text
+    assert (second.text, second.cached) == (first.text, True)
+    assert (model.usage.calls, model.usage.cost_usd, model.usage.unpriced) == (1, 0.0, 0)
+    assert not folder.exists()
+
+
+def test_what_the_offline_writer_does_not_understand_is_told_at_once(folder: Path) -> None:
+    pauses: list[float] = []
+    model = Llm(sleep=pauses.append)
+    with pytest.raises(ReplyError, match=r"^offline/libero: [^:]*: .*colourless green ideas"):
+        model.complete(offline_question("colourless green ideas sleep furiously"))
+    assert pauses == []

@@ -1,0 +1,370 @@
+"""Programs written by a model: the honest ones run, the others end in an error that names line and rule."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.hostile_programs import HOSTILE
+from support.paths import TESTS
+
+from voxposer.sandbox.guard import Budget, HostFault, Limits, Record
+from voxposer.sandbox.interpreter import RULES, Outcome, SandboxError, parse
+
+LIMITS = Limits(steps=200_000, calls=100)
+
+
+class Thing(Record):
+    """An observation with a few fields."""
+
+    def __init__(self, **fields: Any) -> None:
+        self._fields = fields
+
+    def fields(self) -> list[str]:
+        return list(self._fields)
+
+    def __getitem__(self, name: str, /) -> Any:
+        value = self._fields[name]
+        return value.copy() if isinstance(value, np.ndarray) else value
+
+    def __str__(self) -> str:
+        return self._fields["name"]
+
+
+BOWL = Thing(name="bowl", position=np.array([20, 30, 40]), aabb=np.array([[15, 25, 38], [25, 35, 44]]), held=False)
+
+
+def detect(name: str) -> Thing:
+    if name != "bowl":
+        raise KeyError(f"no {name!r}")
+    return BOWL
+
+
+FUNCTIONS = MappingProxyType(
+    {
+        "detect": detect,
+        "get_map": lambda: np.zeros((100, 100, 100)),
+        "get_quats": lambda: np.zeros((100, 100, 100, 4)),
+        "cm2index": lambda cm, axis: int(cm / 2),
+    }
+)
+
+
+def run(source: str, **options: Any) -> Outcome:
+    return parse(source, limits=options.pop("limits", LIMITS)).run(FUNCTIONS, **options)
+
+
+def variables(source: str, **options: Any) -> Mapping[str, Any]:
+    return run(source, **options).variables
+
+
+def refusal(source: str, **options: Any) -> SandboxError:
+    with pytest.raises(SandboxError) as caught:
+        run(source, **options)
+    return caught.value
+
+
+# Hostile programs
+
+
+@pytest.mark.parametrize(("rule", "line", "source"), HOSTILE, ids=[repr(source)[:60] for _, _, source in HOSTILE])
+def test_a_hostile_program_ends_in_an_error_that_names_line_and_rule(rule: str, line: int, source: str) -> None:
+    error = refusal(source)
+    assert (error.rule, error.line) == (rule, line), str(error)
+    assert str(error).startswith(f"line {line}: ")
+    assert str(error).endswith(f"[rule: {rule}]")
+    assert error.reason
+    assert len(str(error)) < 1000
+
+
+def test_every_rule_that_a_program_breaks_is_explained() -> None:
+    assert {rule for rule, _, _ in HOSTILE} <= set(RULES)
+
+
+IN_LITTLE_ROOM = """
+import resource, sys
+sys.path.insert(0, {tests!r})
+import test_sandbox as tests
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 800 * 2**20,) * 2)
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+resource.setrlimit(resource.RLIMIT_NPROC, (0, 0))
+for rule, line, source in tests.HOSTILE:
+    error = tests.refusal(source)
+    assert (error.rule, error.line) == (rule, line), (source[:80], str(error))
+print("all refused", len(tests.HOSTILE))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits an address space as Linux does")
+def test_hostile_programs_are_refused_in_little_memory_without_a_file_or_process(tmp_path: Path) -> None:
+    source = IN_LITTLE_ROOM.format(tests=str(TESTS))
+    command = [sys.executable, "-B", "-c", source]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.stdout.strip() == f"all refused {len(HOSTILE)}", done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_program_is_stopped_when_its_time_is_up() -> None:
+    endless = "while True:\n    pass"
+    error = refusal(endless, limits=Limits(steps=10**9, seconds=0.05))
+    assert error.rule == "time"
+    assert error.line in (1, 2)
+
+
+def test_the_time_that_the_host_takes_is_not_the_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("voxposer.sandbox.guard.time.monotonic", lambda: now[0])
+
+    def slow() -> int:
+        now[0] += 3600
+        return 1
+
+    source = "x = slow()\nfor i in range(2000):\n    x += 1"
+    assert parse(source).run({"slow": slow}).variables["x"] == 2001
+
+
+@given(st.text(alphabet="_.()[]{}:=,+*'\"\n fornixlambdapetcs0129@", max_size=60))
+def test_any_text_runs_or_is_refused(source: str) -> None:
+    try:
+        run(source)
+    except SandboxError as error:
+        assert error.rule in RULES  # noqa: PT017
+
+
+# The host's side
+
+
+def test_an_error_of_a_given_function_names_it_and_is_the_cause() -> None:
+    error = refusal("x = 1\ny = detect('unicorn')")
+    assert (error.line, error.rule) == (2, "call")
+    assert "detect: KeyError" in error.reason
+    assert isinstance(error.__cause__, KeyError)
+
+
+def test_a_fault_of_the_host_passes_unchanged() -> None:
+    fault = HostFault("the robot is on fire")
+
+    def burn() -> None:
+        raise fault
+
+    with pytest.raises(HostFault) as caught:
+        parse("burn()").run({"burn": burn})
+    assert caught.value is fault
+
+
+def test_a_function_that_returns_what_no_program_may_hold_is_named() -> None:
+    with pytest.raises(SandboxError, match="module is no kind of value") as caught:
+        parse("x = leak()").run({"leak": lambda: np})
+    assert caught.value.rule == "values"
+
+
+def test_programs_share_a_budget_with_those_that_call_them() -> None:
+    budget = Budget(Limits(steps=1000))
+    inner = parse("for i in range(50):\n    x = i")
+
+    def again() -> None:
+        inner.run({}, budget=budget)
+
+    with pytest.raises(SandboxError, match="more than 1000 steps") as caught:
+        parse("while True:\n    again()").run({"again": again}, budget=budget)
+    assert isinstance(caught.value.__cause__, SandboxError)
+
+
+def test_what_a_program_reads_of_an_observation_is_its_own() -> None:
+    found = variables("p = detect('bowl').position\np[0] = 99\nq = detect('bowl').position")
+    assert found["p"].tolist() == [99, 30, 40]
+    assert found["q"].tolist() == [20, 30, 40]
+
+
+def test_an_observation_in_text_is_its_name_and_a_position_its_numbers() -> None:
+    found = variables("b = detect('bowl')\nx = f'{b} at {b.position}, {[b, b.position[0]]}'")
+    assert found["x"] == "bowl at [20 30 40], ['bowl', 20]"
+
+
+def test_an_error_quotes_the_line() -> None:
+    assert "`y = x / 0`" in str(refusal("x = 1\ny = x / 0\nz = 2"))
+
+
+def test_a_name_that_is_nearly_known_is_suggested() -> None:
+    assert "did you mean 'detect'" in refusal("x = detekt('bowl')").reason
+    assert "did you mean np.linalg.norm" in refusal("x = np.linalg.nrom([1])").reason
+
+
+# Honest programs: what Python would have computed
+
+
+PYTHON = (
+    "a = b = 3\nc = a * b - 7 // 2 + 2 ** 3 % 5 - 1.5 / 3",
+    "(a, b), [c, d] = (1, 2), [3, 4]\na, b = b, a",
+    "x = [1, 2, 3]\ny = x\ny += [4]\nx[0] = 9\nz = x[1:] + x[:-1]",
+    "x = 0\nfor i in range(10):\n    if i == 3:\n        continue\n    if i == 7:\n        break\n    x += i",
+    "x = 10\nwhile x > 3 and x != 5:\n    x -= 1",
+    "x = [i * j for i in range(4) if i % 2 for j in range(3) if j != 1]\ni = 5\ny = [i for i in [1]]\nz = i",
+    "x = {'a': 1, 2: 'b'}\nx['c'] = [1]\ny = [k for k in x]\nz = [v for k, v in x.items()]\nw = x.get('q', 7)",
+    "x = 'a' if 1 < 2 < 3 else 'b'\ny = not x == 'b'\nz = 0 or None or 'end'\nw = 1 and 2",
+    "x = f'{1 + 1} of {3.14159:.2f} {\"s\"!s:>4} {7:03d} {[1, 2.5]}'",
+    "x = max(3, 1, 2), min([4, 5]), sum([1, 2]), abs(-3), round(2.567, 1), len('abc')",
+    "x = sorted([3, 1, 2], reverse=True)\ny = list(reversed(x))\nz = list(enumerate(['a']))\nw = list(zip([1], [2]))",
+    "x = 'Top Drawer'.lower().split()\ny = ' '.join(x)\nz = 'top' in y\nw = y.replace('top', 'b')",
+    "x = [3, 1]\nx.append(2)\nx.sort()\nx.insert(0, 9)\ny = x.pop()\nz = x.index(1)\nx.reverse()",
+    "x = 5 in range(10)\ny = 5.5 in range(10)\nz = None is None\nw = 3 not in [1, 2]",
+    "x = any([0, 1]), all([0, 1]), bool([]), int('7'), float('1.5'), str(None), tuple([1])",
+    "x = ~5 & 12 | 3 ^ 1\ny = -x\nz = +y",
+    "x = 1\nif x > 1:\n    y = 'a'\nelif x == 1:\n    y = 'b'\nelse:\n    y = 'c'",
+)
+
+
+@pytest.mark.parametrize("source", PYTHON)
+def test_honest_python_means_what_python_means(source: str) -> None:
+    expected: dict[str, Any] = {}
+    exec(source, {}, expected)
+    assert dict(variables(source)) == expected
+
+
+NUMPY = (
+    "np.array([1, 2, 3]) * 2 + np.array([0.5])",
+    "np.linalg.norm(np.array([3, 4]) - [0, 0])",
+    "np.linalg.norm(np.array([[3, 4], [6, 8]]), axis=1)",
+    "np.zeros((2, 3), dtype=int)",
+    "np.full((2, 2), np.pi)",
+    "np.arange(2, 10, 3)",
+    "np.linspace(0, 1, 5)",
+    "np.clip([1, 5, 9], 2, 6)",
+    "np.where(np.array([1, 0]) > 0, 7, 8)",
+    "np.array(np.where(np.array([1, 0, 1]) > 0))",
+    "np.argwhere(np.eye(3) == 1)",
+    "np.stack([np.array([1, 2]), np.array([3, 4])], axis=1)",
+    "np.concatenate([[1], [2, 3]])",
+    "np.cross([1, 0, 0], [0, 1, 0])",
+    "np.dot([[1, 2], [3, 4]], [1, 1])",
+    "np.array([[1, 2], [3, 4]]) @ np.array([1, 1])",
+    "np.round(np.array([1.234, 5.678]), 1)",
+    "np.array([1.7, 2.2]).astype(int)",
+    "np.array([[1, 2], [3, 4]]).mean(axis=0)",
+    "np.array([3, 1, 2]).argmin()",
+    "np.argmax(np.array([[1, 9], [3, 4]]), axis=1)",
+    "np.array(np.unravel_index(5, (2, 3)))",
+    "np.array([1, 2, 3])[::-1]",
+    "np.array([[1, 2], [3, 4]])[:, 1]",
+    "np.array([[1, 2], [3, 4]])[[0, 1], [1, 0]]",
+    "np.array([5, 6, 7])[np.array([True, False, True])]",
+    "np.array([[1, 2], [3, 4]]).T",
+    "np.sum(np.ones((3, 4)), axis=(0, 1))",
+    "np.arctan2(1, 2) + np.deg2rad(90) + np.sqrt(2)",
+    "np.maximum([1, 5], 3)",
+    "np.logical_and(np.array([True, False]), True)",
+    "np.meshgrid([1, 2], [3], indexing='ij')[0]",
+    "np.array([1, 2, 3, 4]).reshape(2, 2)",
+    "np.array([1, 2, 3, 4]).reshape((2, -1))",
+    "np.median([1, 5, 2])",
+    "np.roll([1, 2, 3], 1)",
+    "np.allclose([1.0], [1.0 + 1e-9])",
+    "np.expand_dims(np.array([1, 2]), 0)",
+    "np.interp(0.5, [0, 1], [10, 20])",
+    "np.array([4, 2]).copy().max()",
+)
+
+
+@pytest.mark.parametrize("expression", NUMPY)
+def test_honest_numpy_means_what_numpy_means(expression: str) -> None:
+    expected = eval(expression, {"np": np})
+    found = variables(f"x = {expression}")["x"]
+    np.testing.assert_array_equal(found, expected)
+    assert np.asarray(found).dtype == np.asarray(expected).dtype
+
+
+# Maps
+
+
+def marked(source: str) -> list[list[int]]:
+    """Voxels that are 1 in the map ``m`` of a program."""
+    return np.argwhere(variables(f"m = get_map()\n{source}")["m"] == 1).tolist()
+
+
+@pytest.mark.parametrize(
+    ("index", "voxel"),
+    [
+        ("1, 2, 3", [1, 2, 3]),
+        ("1.4, 2.6, 3.0", [1, 3, 3]),
+        ("250, 99, 100", [99, 99, 99]),
+        ("-7, 2, 3", [0, 2, 3]),
+        ("-1, 2, 3", [99, 2, 3]),
+        ("np.array([1, 2, 3])", [1, 2, 3]),
+        ("np.array([1.2, 2.9, 300])", [1, 3, 99]),
+        ("[1, 2, 3]", [1, 2, 3]),
+        ("(1, 2, np.int64(3))", None),
+        ("detect('bowl').position", [20, 30, 40]),
+    ],
+)
+def test_an_index_into_a_map_is_made_to_fit(index: str, voxel: list[int] | None) -> None:
+    if voxel is None:
+        assert refusal(f"m = get_map()\nm[{index}] = 1").rule == "names"
+    else:
+        assert marked(f"m[{index}] = 1") == [voxel]
+
+
+def test_a_slice_of_a_map_begins_at_its_start_when_asked_to_begin_before_it() -> None:
+    assert marked("m[-3:2, 5, 5] = 1") == [[0, 5, 5], [1, 5, 5]]
+    assert marked("m[-3:-2, 5, 5] = 1") == []
+    assert marked("m[97.6:, 5, 5] = 1") == [[98, 5, 5], [99, 5, 5]]
+    assert marked("m[..., 5, 5][:2] = 1") == [[0, 5, 5], [1, 5, 5]]
+    assert marked("m[3, ..., 5][:2] = 1") == [[3, 0, 5], [3, 1, 5]]
+
+
+def test_a_map_is_written_by_a_mask_and_by_lists_of_places() -> None:
+    assert marked("g = np.indices((100, 100, 100))\nm[(g[0] + g[1] + g[2]) < 1] = 1") == [[0, 0, 0]]
+    assert marked("m[np.array([1, 2]), np.array([3, 400]), 5] = 1") == [[1, 3, 5], [2, 99, 5]]
+
+
+def test_a_quaternion_is_written_to_every_voxel_or_where_a_mask_says() -> None:
+    source = "q = get_quats()\nq[:, :, :] = [1, 0, 0, 0]\nq[get_map() == 0] = [0, 1, 0, 0]\nx = q[500, 0, 0.4]"
+    assert variables(source)["x"].tolist() == [0, 1, 0, 0]
+
+
+def test_many_single_voxels_fit_into_the_budget() -> None:
+    source = "m = get_map()\nfor x in range(40):\n    for y in range(40):\n        m[x, y, 5] = 1\ns = m.sum()"
+    assert variables(source)["s"] == 1600
+
+
+def test_changing_a_map_in_place_takes_no_memory() -> None:
+    source = "m = get_map()\nfor i in range(100):\n    m += 1\n    m = same(m)\n    m[:50] *= 1\ns = m.max()"
+    functions = {**FUNCTIONS, "same": lambda value: value}
+    assert parse(source, limits=Limits(memory_bytes=20_000_000)).run(functions).variables["s"] == 100
+
+
+# What is returned
+
+
+@pytest.mark.parametrize(
+    ("source", "value"),
+    [
+        ("ret_val = 3", 3),
+        ("if True:\n    ret_val = 1\nelse:\n    ret_val = 2", 1),
+        ("for x in [1, 2, 3]:\n    if x > 1:\n        ret_val = x", 2),
+        ("ret_val = []\nfor x in [1, 2]:\n    ret_val.append(x)", [1, 2]),
+        ("ret_val = 0\nfor x in [1, 2]:\n    ret_val += x", 3),
+        ("x = ret_val = 4\nx = 5", 4),
+        ("return 6", 6),
+        ("x = 1", None),
+    ],
+)
+def test_an_assignment_to_the_return_value_returns_unless_it_is_read(source: str, value: Any) -> None:
+    assert run(source, returns="ret_val").value == value
+
+
+def test_without_a_return_value_the_name_is_a_variable_like_any_other() -> None:
+    assert variables("ret_val = 1\nret_val = 2")["ret_val"] == 2
+
+
+def test_a_program_runs_again_from_the_start() -> None:
+    program = parse("x = x + [1]\nret_val = x")
+    assert [program.run({}, {"x": [0]}, returns="ret_val").value for _ in range(2)] == [[0, 1], [0, 1]]

@@ -1,0 +1,282 @@
+"""What an agent is asked to achieve in a scene, and how far it has come: verdicts and potentials of one world, in JAX.
+
+In: a scene, a task and the name of an objective; later a world's state. Out: ``success`` (bool) and ``potential`` (from
+0 to 1, higher is closer), pure functions for ``jit`` and ``vmap``.
+
+``goal``: the task's own BDDL goal, judged as everywhere else in this package.
+``reach``: the point between the fingertips is within ``reach_distance`` of the box around the target's collision
+geometry; the box turns with the target.
+``lift``: the target's origin is ``lift_height`` above where it was when the episode began.
+
+A shaped reward is the sparse one plus the change of the potential. Its sum over an episode is at most 2, and as no
+potential exceeds the 1 that success is worth, an agent gains nothing by staying close without succeeding.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from vecenv.libero.scene import goals
+from vecenv.libero.scene.bddl import Problem
+from vecenv.libero.scene.scene import Scene
+from vecenv.util.rotations import safe_norm
+
+OBJECTIVES = ("goal", "reach", "lift")
+
+# Distances in metres (and joint positions in radians) are scored 1 - tanh(5 d): 0.5 at 11 cm.
+_SHARPNESS = 5.0
+# How far below a thing's top a hand takes hold of it: about the length of the finger pads, metres.
+_GRASP_DEPTH = 0.03
+# Within about this distance of the grasp point closing the hand counts as progress, metres.
+_GRASP_RADIUS = 0.03
+
+
+class ObjectiveError(ValueError):
+    """An objective that the scene does not offer; the message says what would be right."""
+
+
+class View(NamedTuple):
+    """What objectives read of one world; kinematics as of the start of the last substep.
+
+    Attributes:
+        qpos: [nq].
+        xpos: body positions, world frame, metres, [nbody, 3].
+        xquat: body orientations, wxyz, [nbody, 4].
+        site_xpos: site positions, [nsite, 3].
+        site_xmat: site rotations, [nsite, 3, 3].
+        touch: contact sensors, [nsensordata].
+        gripper: integrated finger targets; the first is 1 when the hand opens fully and -1 when it closes fully, [2].
+        start_height: height of the target's origin when the episode began, metres.
+    """
+
+    qpos: jax.Array
+    xpos: jax.Array
+    xquat: jax.Array
+    site_xpos: jax.Array
+    site_xmat: jax.Array
+    touch: jax.Array
+    gripper: jax.Array
+    start_height: jax.Array
+
+
+class Box(NamedTuple):
+    """A box in a body's frame: ``body`` id, ``centre`` [3] and ``half`` extents [3] in metres."""
+
+    body: int
+    centre: np.ndarray
+    half: np.ndarray
+
+
+def default_target(scene: Scene, problem: Problem, *, movable: bool) -> str:
+    """The first thing the task is about: an object if there is one, else (unless ``movable``) a fixture.
+
+    Raises:
+        ObjectiveError: there is none.
+    """
+    owners = {region.name: region.target for region in problem.regions}
+    named = [owners.get(name, name) for name in problem.obj_of_interest]
+    known = [scene.entities[name] for name in named if name in scene.entities]
+    objects = [entity.name for entity in known if not entity.fixture]
+    if objects:
+        return objects[0]
+    if movable or not known:
+        choices = ", ".join(entity.name for entity in scene.objects)
+        raise ObjectiveError(f"{problem.source} is about no movable object; give target, one of {choices}")
+    return known[0].name
+
+
+def body_box(model: mujoco.MjModel, body: int) -> Box:
+    """The box around the collision geometry of a body and of all that hangs on it, joints at their reference.
+
+    A body without collision geometry has a box of no size at its origin.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    mujoco.mj_kinematics(model, data)
+    solid = (model.geom_contype | model.geom_conaffinity) != 0
+    corners = [_corners(model, data, geom) for geom in np.flatnonzero(solid).tolist() if _hangs_on(model, geom, body)]
+    local = (np.concatenate([*corners, data.xpos[None, body]]) - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+    if corners:
+        local = local[:-1]
+    low, high = local.min(axis=0), local.max(axis=0)
+    return Box(body, ((low + high) / 2).astype(np.float32), ((high - low) / 2).astype(np.float32))
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """World positions of the corners of the box around a geom, [8, 3]."""
+    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    local = centre + half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    return data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T
+
+
+def _hangs_on(model: mujoco.MjModel, geom: int, body: int) -> bool:
+    carrier = int(model.geom_bodyid[geom])
+    while carrier not in (0, body):
+        carrier = int(model.body_parentid[carrier])
+    return carrier == body
+
+
+class Objective:
+    """One objective in one scene.
+
+    Args:
+        scene: the compiled scene.
+        problem: the task.
+        kind: one of ``OBJECTIVES``.
+        target: name of an object, or of a fixture unless it is to be lifted; None for the first the task is about.
+        reach_distance: metres.
+        lift_height: metres.
+
+    Raises:
+        ObjectiveError: an unknown kind or target, or a target that cannot be lifted.
+
+    Attributes:
+        target: name of the target.
+        box: box around the target.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        problem: Problem,
+        kind: str,
+        *,
+        target: str | None = None,
+        reach_distance: float = 0.02,
+        lift_height: float = 0.05,
+    ) -> None:
+        if kind not in OBJECTIVES:
+            raise ObjectiveError(f"objective={kind!r}: expected one of {', '.join(OBJECTIVES)}")
+        self.kind, self._grip_site = kind, scene.grip_site
+        self.target = target or default_target(scene, problem, movable=kind == "lift")
+        if self.target not in scene.entities:
+            raise ObjectiveError(f"target={self.target!r}: this scene has {', '.join(scene.entities)}")
+        if kind == "lift" and scene.entities[self.target].fixture:
+            choices = ", ".join(entity.name for entity in scene.objects)
+            raise ObjectiveError(f"target={self.target!r} is fixed to the world; lift one of {choices}")
+        self._reach_distance, self._lift_height = reach_distance, lift_height
+        self.box = body_box(scene.model, scene.model.body(scene.entities[self.target].root_body).id)
+        table = goals.build_table([problem], scene, [0])
+        self._table = goals.GoalTable(*(np.asarray(column) for column in table))
+        self._subjects = [body_box(scene.model, body) for body in _subjects(scene.model, self._table)]
+
+    def height(self, view: View) -> jax.Array:
+        """Height of the target's origin, metres."""
+        return view.xpos[self.box.body, 2]
+
+    def offset(self, view: View) -> jax.Array:
+        """From the point between the fingertips to the centre of the target's box, metres, world frame, [3]."""
+        return _centre(view, self.box) - self._grip(view)
+
+    def success(self, view: View) -> jax.Array:
+        """Whether the objective is achieved, bool."""
+        if self.kind == "reach":
+            return _distance(view, self.box, self._grip(view)) <= self._reach_distance
+        if self.kind == "lift":
+            return self.height(view) - view.start_height >= self._lift_height
+        return jnp.all(self._holds(view))
+
+    def potential(self, view: View) -> jax.Array:
+        """How near the objective is, in [0, 1].
+
+        ``reach``: the score of the distance to the box, see ``reach_distance``.
+        ``lift``: 0.3 for nearness to a point at most 3 cm below the target's top, 0.2 for closing the hand there, 0.5
+        for the height gained.
+        ``goal``: the mean over the goal's predicates: 1 if one holds, else 0.6 for nearness of the thing to its place
+        (of the joint to its bound), and for the first that does not hold 0.3 for nearness of the hand to the thing.
+        """
+        if self.kind == "reach":
+            return _score(_distance(view, self.box, self._grip(view)))
+        return self._lifted(view) if self.kind == "lift" else self._towards_goal(view)
+
+    def _grip(self, view: View) -> jax.Array:
+        return view.site_xpos[self._grip_site]
+
+    def _lifted(self, view: View) -> jax.Array:
+        away = safe_norm(_grasp_point(view, self.box) - self._grip(view))
+        closing = jnp.exp(-((away / _GRASP_RADIUS) ** 2)) * (1 - view.gripper[0]) / 2
+        gained = jnp.clip((self.height(view) - view.start_height) / self._lift_height, 0, 1)
+        return 0.3 * _score(away) + 0.2 * closing + 0.5 * gained
+
+    def _towards_goal(self, view: View) -> jax.Array:
+        holds = self._holds(view)
+        placed = jnp.stack([_score(self._missing(view, i)) for i in range(len(self._subjects))])
+        near = jnp.stack([_score(_distance(view, box, self._grip(view))) for box in self._subjects])
+        first = jnp.arange(len(holds)) == jnp.argmin(holds)
+        return jnp.mean(jnp.where(holds, 1.0, 0.6 * placed + 0.3 * jnp.where(first, near, 0.0)))
+
+    def _holds(self, view: View) -> jax.Array:
+        """Which predicates of the goal hold, bool [P]."""
+        table = jax.tree.map(jnp.asarray, self._table)
+        return goals.predicates(
+            table,
+            xpos=view.xpos[None],
+            site_xpos=view.site_xpos[None],
+            site_xmat=view.site_xmat[None],
+            qpos=view.qpos[None],
+            touch=view.touch[None],
+            xp=jnp,
+        )[0]
+
+    def _missing(self, view: View, index: int) -> jax.Array:
+        """How far the thing of one predicate is from its place, metres, or a joint from its bound."""
+        row = goals.GoalTable(*(column[0, index] for column in self._table))
+        if row.kind in (goals.ANY_JOINT, goals.ALL_JOINTS):
+            used = row.joint_used
+            gaps = jnp.maximum(row.joint_bound[used] - row.joint_sign[used] * view.qpos[row.joint[used]], 0.0)
+            return jnp.min(gaps) if row.kind == goals.ANY_JOINT else jnp.max(gaps)
+        if row.kind in (goals.IN_REGION, goals.ON_REGION):
+            place = jnp.asarray(row.zone_pos) if row.site < 0 else view.site_xpos[row.site]
+            return safe_norm(view.xpos[row.body] - place)
+        if row.kind == goals.ON_OBJECT:
+            return safe_norm(view.xpos[row.body] - view.xpos[row.reference])
+        if row.kind == goals.UP:
+            return jnp.maximum(goals.UP_HEIGHT - view.xpos[row.body, 2], 0.0)
+        return jnp.zeros(())
+
+
+def _subjects(model: mujoco.MjModel, table: goals.GoalTable) -> list[int]:
+    """The body that each predicate is about: the thing, or the part that a joint moves."""
+    jointed = np.isin(table.kind[0], (goals.ANY_JOINT, goals.ALL_JOINTS))
+    owners = {int(at): int(body) for at, body in zip(model.jnt_qposadr, model.jnt_bodyid, strict=True)}
+    return [
+        owners[int(joint[0])] if by_joint else int(body)
+        for by_joint, joint, body in zip(jointed, table.joint[0], table.body[0], strict=True)
+    ]
+
+
+def _score(distance: jax.Array) -> jax.Array:
+    return 1 - jnp.tanh(_SHARPNESS * distance)
+
+
+def _axes(view: View, body: int) -> jax.Array:
+    """Rotation matrix of a body, [3, 3]; from the quaternion, which is all that is kept."""
+    w, x, y, z = view.xquat[body]
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _centre(view: View, box: Box) -> jax.Array:
+    return view.xpos[box.body] + jnp.sum(_axes(view, box.body) * box.centre, axis=-1)
+
+
+def _distance(view: View, box: Box, point: jax.Array) -> jax.Array:
+    """From a point to a box, metres; 0 inside."""
+    axes = _axes(view, box.body)
+    local = jnp.sum(axes * (point - view.xpos[box.body])[:, None], axis=0) - box.centre
+    return safe_norm(jnp.maximum(jnp.abs(local) - box.half, 0.0))
+
+
+def _grasp_point(view: View, box: Box) -> jax.Array:
+    """Where a hand from above takes hold: on the box's vertical middle line, near its top."""
+    half_height = jnp.sum(jnp.abs(_axes(view, box.body)[2]) * box.half)
+    return _centre(view, box) + jnp.maximum(half_height - _GRASP_DEPTH, 0.0) * jnp.asarray([0.0, 0.0, 1.0])

@@ -1,0 +1,1 @@
+"""MJX as a backend: model, control step, rollout."""

@@ -1,0 +1,1 @@
+"""Camera images of LIBERO scenes: OpenGL, ray tracing on the GPU, and what both draw."""

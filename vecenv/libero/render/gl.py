@@ -1,0 +1,477 @@
+"""Pictures of a batch in GL: a few threads, each with one GL context, take slots one by one.
+
+In: a stage a scene (``vecenv.libero.render.drawing``), a shot a slot, cameras. Out: arrays [B, H, W, ...] of colours,
+depths and instances, and where the cameras are. MuJoCo's own renderer draws, so ``lod="exact"`` is upstream's picture;
+it releases Python's lock while it draws, so threads draw in parallel and there is no process an environment. A thread
+uploads a scene the first time it draws it, and threads prefer scenes they have.
+
+EGL and OSMesa both draw without a display; physics needs neither.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import functools
+import importlib
+import itertools
+import os
+import queue
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from vecenv.contract import CameraView
+from vecenv.libero.render.displays import egl_context
+from vecenv.libero.render.drawing import Pose, Stage, View, camera_view
+from vecenv.libero.render.options import RenderError, UserCamera, VisualOptions
+from vecenv.util.cores import usable_cores
+
+# Library that each way to a context needs, and what installs it.
+PACKAGES: Mapping[str, tuple[tuple[str, ...], str]] = {
+    "egl": (("libEGL.so.1", "libEGL.so"), "apt-get install libegl1 libgl1-mesa-dri (Debian, Ubuntu), or a GPU driver"),
+    "osmesa": (("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"), "apt-get install libosmesa6 (Debian, Ubuntu)"),
+}
+_VARIABLE = "MUJOCO_GL"
+_ATTEMPTS = 2
+_AS_CODES = (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR)
+
+# EGL's display is made with the first context, which only one thread may do.
+_opening = threading.Lock()
+
+
+class GlError(RuntimeError):
+    """There is no GL to draw with, or it failed; the message says what would help."""
+
+
+class _ContextLost(Exception):
+    """GL reports an error: what was uploaded may be gone."""
+
+
+def available() -> tuple[str, ...]:
+    """Ways to a context whose library is installed, the one to prefer first."""
+    return tuple(name for name, (libraries, _) in PACKAGES.items() if any(map(_loads, libraries)))
+
+
+def choose(gl: str | None = None) -> str:
+    """The way to a context: as asked, else what ``MUJOCO_GL`` says, else the first whose library is installed.
+
+    Raises:
+        GlError: it is not known or its library is not installed.
+    """
+    there, wanted = available(), gl or os.environ.get(_VARIABLE, "").lower().strip()
+    if wanted in PACKAGES:
+        if wanted not in there:
+            raise GlError(
+                f"cannot render: lib{wanted.replace('osm', 'OSM').replace('egl', 'EGL')} is not installed; "
+                f"{PACKAGES[wanted][1]}. Physics does not need it."
+            )
+        return wanted
+    if gl is not None:
+        raise GlError(f"gl={gl!r}: expected one of {', '.join(PACKAGES)}")
+    if not there:
+        ways = "; or ".join(how for _, how in PACKAGES.values())
+        raise GlError(f"cannot render: no GL library is installed; {ways}. Physics does not need it.")
+    return there[0]
+
+
+def open_context(gl: str, height: int, width: int) -> Any:
+    """A GL context, current in this thread; it has MuJoCo's ``free``.
+
+    Raises:
+        GlError: the driver refuses.
+    """
+    try:
+        with _opening:
+            make = importlib.import_module(f"mujoco.{gl}").GLContext
+            context = egl_context(width, height) if gl == "egl" else make(width, height)
+        context.make_current()
+    except Exception as error:  # whatever PyOpenGL raises for this driver
+        other = " or ".join(f"{_VARIABLE}={name}" for name in available() if name != gl)
+        hint = f"; a new process may try {other}" if other else ""
+        raise GlError(
+            f"cannot render: {gl} gives no GL context ({_first_line(error)}); {PACKAGES[gl][1]}{hint}. "
+            "`vecenv doctor` shows what works. Physics does not need it."
+        ) from error
+    return context
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+def _first_line(error: BaseException) -> str:
+    try:
+        text = str(error)
+    except Exception:  # PyOpenGL's own errors sometimes cannot be printed
+        text = ""
+    return f"{type(error).__name__}: {text}".splitlines()[0]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What one slot shows: the stage (index) it is on, its pose, and its visual options."""
+
+    stage: int
+    pose: Pose
+    options: VisualOptions = field(default_factory=VisualOptions)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which images of a camera to make."""
+
+    rgb: bool = True
+    depth: bool = False
+    segmentation: bool = False
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Images of B slots by camera, as delivered: rows from the top, mirrored.
+
+    Attributes:
+        rgb: uint8 [B, H, W, 3].
+        depth: metres from the camera's plane, float32 [B, H, W].
+        segmentation: index into the stage's ``instances``, int16 [B, H, W].
+        views: where the cameras are.
+    """
+
+    rgb: Mapping[str, np.ndarray]
+    depth: Mapping[str, np.ndarray]
+    segmentation: Mapping[str, np.ndarray]
+    views: Mapping[str, CameraView]
+
+
+class GlRenderer:
+    """Renders batches; safe to use from several threads, one call at a time each.
+
+    Args:
+        stages: the scenes.
+        height, width: of the images, pixels.
+        num_threads: drawing threads; None for one a core. Where the driver gives fewer contexts, fewer draw.
+        gl: ``"egl"``, ``"osmesa"`` or None (``choose``).
+
+    Raises:
+        GlError: there is no GL to draw with.
+    """
+
+    def __init__(
+        self,
+        stages: Sequence[Stage],
+        *,
+        height: int = 256,
+        width: int = 256,
+        num_threads: int | None = None,
+        gl: str | None = None,
+    ) -> None:
+        self.stages, self.height, self.width = tuple(stages), height, width
+        self.gl = choose(gl)
+        self._calls = threading.Lock()
+        self._threads: list[_Thread] = []
+        failures: list[GlError] = []
+        for _ in range(num_threads or usable_cores()):
+            thread = _Thread(_Painter(self.stages, self.gl, height, width))
+            try:
+                thread.run(thread.painter.open).result()
+                self._threads.append(thread)
+            except GlError as error:
+                thread.stop()
+                failures.append(error)
+                break
+        if not self._threads:
+            raise failures[0]
+        _live.add(self)
+        _close_at_exit()
+
+    @property
+    def num_threads(self) -> int:
+        """Threads that draw; fewer than asked for when the driver ran out of contexts."""
+        return len(self._threads)
+
+    def render(
+        self,
+        shots: Sequence[Shot],
+        cameras: Sequence[str | UserCamera],
+        wanted: Wanted = Wanted(),
+        out: Mapping[str, np.ndarray] | None = None,
+    ) -> Frames:
+        """Render every slot through every camera.
+
+        Args:
+            shots: one a slot.
+            cameras: names of the scenes' cameras, ``"wrist"``, or user cameras.
+            wanted: which images.
+            out: colour arrays to fill, by camera, uint8 [B, H, W, 3]; new ones are made for the others.
+
+        Raises:
+            RenderError: a camera, instance, material or texture that a scene does not have, or an array that is not
+                of the right shape.
+            GlError: GL failed, also after its contexts were made anew; or the renderer is closed.
+        """
+        job = _Job.of(self, shots, cameras, wanted, out or {})
+        with self._calls:
+            if not self._threads:
+                raise GlError("the renderer is closed")
+            self._share_out(job)
+        return job.frames()
+
+    def close(self) -> None:
+        """Free the contexts and end the threads. Closing twice is harmless."""
+        with self._calls:
+            threads, self._threads = self._threads, []
+        for thread in threads:
+            thread.stop()
+        _live.discard(self)
+
+    def _share_out(self, job: _Job) -> None:
+        order = sorted(range(len(job.shots)), key=lambda slot: job.shots[slot].stage)
+        # Few slots: a task is one image, so that all threads have one.
+        each = 1 if len(order) < 2 * len(self._threads) else len(job.cameras)
+        tasks = [
+            _Task(slot, range(first, min(first + each, len(job.cameras))))
+            for slot in order
+            for first in range(0, len(job.cameras), each)
+        ]
+        bounds = np.linspace(0, len(tasks), len(self._threads) + 1).astype(int)
+        shares = [deque(tasks[low:high]) for low, high in itertools.pairwise(bounds.tolist())]
+        running = [
+            thread.run(_work_off, thread.painter, job, shares, number) for number, thread in enumerate(self._threads)
+        ]
+        errors = [error for future in running if (error := future.exception()) is not None]
+        if errors:
+            raise errors[0]
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Some cameras of one slot."""
+
+    slot: int
+    cameras: range
+
+
+@dataclass
+class _Job:
+    """One call of ``render``."""
+
+    shots: Sequence[Shot]
+    cameras: Sequence[str | UserCamera]
+    wanted: Wanted
+    rgb: dict[str, np.ndarray]
+    depth: dict[str, np.ndarray]
+    segmentation: dict[str, np.ndarray]
+    views: dict[str, list[View | None]]
+
+    @classmethod
+    def of(
+        cls,
+        renderer: GlRenderer,
+        shots: Sequence[Shot],
+        cameras: Sequence[str | UserCamera],
+        wanted: Wanted,
+        out: Mapping[str, np.ndarray],
+    ) -> _Job:
+        for stage, options in {(shot.stage, id(shot.options)): (shot.stage, shot.options) for shot in shots}.values():
+            renderer.stages[stage].check(cameras, options)
+        names = [camera_name(camera) for camera in cameras]
+        size = (len(shots), renderer.height, renderer.width)
+        for name, array in out.items():
+            if array.shape != (*size, 3) or array.dtype != np.uint8:
+                raise RenderError(f"out[{name!r}] is {array.dtype} {array.shape}; expected uint8 {(*size, 3)}")
+        return cls(
+            shots=shots,
+            cameras=cameras,
+            wanted=wanted,
+            rgb={n: out[n] if n in out else np.empty((*size, 3), np.uint8) for n in names if wanted.rgb},
+            depth={n: np.empty(size, np.float32) for n in names if wanted.depth},
+            segmentation={n: np.empty(size, np.int16) for n in names if wanted.segmentation},
+            views={n: [None] * len(shots) for n in names},
+        )
+
+    def frames(self) -> Frames:
+        height, width = next(iter((*self.rgb.values(), *self.depth.values(), *self.segmentation.values()))).shape[1:3]
+        views = {
+            name: camera_view([view for view in row if view is not None], height, width)
+            for name, row in self.views.items()
+            if row
+        }
+        return Frames(self.rgb, self.depth, self.segmentation, views)
+
+
+def camera_name(camera: str | UserCamera) -> str:
+    """How images name a camera."""
+    return camera if isinstance(camera, str) else camera.name
+
+
+def _work_off(painter: _Painter, job: _Job, shares: Sequence[deque[_Task]], own: int) -> None:
+    """Draw the own share, then help others with scenes that are uploaded here already."""
+    with contextlib.suppress(IndexError):
+        while True:
+            painter.draw(job, shares[own].popleft())
+    for share in shares:
+        with contextlib.suppress(IndexError):
+            while painter.knows(job.shots[share[-1].slot].stage):
+                painter.draw(job, share.pop())
+
+
+class _Painter:
+    """One thread's GL context and what is uploaded to it; only that thread may call its methods."""
+
+    def __init__(self, stages: Sequence[Stage], gl: str, height: int, width: int) -> None:
+        self._stages, self._gl = stages, gl
+        self._rect, self._aspect = mujoco.MjrRect(0, 0, width, height), width / height
+        self._pixels = np.empty((height, width, 3), np.uint8)
+        self._depth = np.empty((height, width), np.float32)
+        self._window: Any = None
+        self._contexts: dict[int, mujoco.MjrContext] = {}
+        self._frames: dict[int, list[mujoco.MjvScene]] = {}
+
+    def open(self) -> None:
+        """Make the GL context."""
+        self._window = open_context(self._gl, *self._depth.shape)
+
+    def close(self) -> None:
+        """Free everything; what GL has lost already cannot be freed and is let go."""
+        for context in self._contexts.values():
+            with contextlib.suppress(Exception):
+                context.free()
+        self._contexts, self._frames = {}, {}
+        if self._window is not None:
+            with contextlib.suppress(Exception):
+                self._window.free()
+        self._window = None
+
+    def knows(self, stage: int) -> bool:
+        """Whether a scene is uploaded."""
+        return stage in self._contexts
+
+    def draw(self, job: _Job, task: _Task) -> None:
+        """Draw a task; when GL has lost its context, make it anew and try again."""
+        for attempt in range(_ATTEMPTS):
+            try:
+                self._draw(job, task)
+                return
+            except (_ContextLost, mujoco.FatalError) as error:
+                self.close()
+                if attempt + 1 == _ATTEMPTS:
+                    raise GlError(f"cannot render: {self._gl} fails again and again ({error})") from error
+                self.open()
+
+    def _draw(self, job: _Job, task: _Task) -> None:
+        shot = job.shots[task.slot]
+        stage, context = self._stages[shot.stage], self._context(shot.stage)
+        frames = self._frames_for(shot.stage, len(task.cameras))
+        cameras = [job.cameras[index] for index in task.cameras]
+        views = stage.fill(frames, cameras, shot.pose, shot.options, slot=task.slot, aspect=self._aspect)
+        for frame, camera, view in zip(frames, cameras, views, strict=True):
+            name = camera_name(camera)
+            job.views[name][task.slot] = view
+            self._shoot(stage, context, frame, name, job, task.slot)
+
+    def _shoot(
+        self, stage: Stage, context: mujoco.MjrContext, frame: mujoco.MjvScene, name: str, job: _Job, slot: int
+    ) -> None:
+        """Draw one frame and deliver its images, turned by 180 degrees against GL's rows from the bottom."""
+        if job.wanted.rgb:
+            mujoco.mjr_render(self._rect, frame, context)
+            mujoco.mjr_readPixels(self._pixels, None, self._rect, context)
+            _check()
+            job.rgb[name][slot] = self._pixels[::-1, ::-1]
+        if job.wanted.depth or job.wanted.segmentation:
+            codes = self._codes(frame, context)
+            if job.wanted.depth:
+                job.depth[name][slot] = _metres(self._depth, *stage.clip_planes)[::-1, ::-1]
+            if job.wanted.segmentation:
+                job.segmentation[name][slot] = stage.segment(frame, codes)[::-1, ::-1]
+
+    def _codes(self, frame: mujoco.MjvScene, context: mujoco.MjrContext) -> np.ndarray:
+        """MuJoCo's segment codes [H, W]; depth comes with them, undisturbed by antialiasing."""
+        frame.flags[list(map(int, _AS_CODES))] = 1
+        mujoco.mjr_render(self._rect, frame, context)
+        mujoco.mjr_readPixels(self._pixels, self._depth, self._rect, context)
+        frame.flags[list(map(int, _AS_CODES))] = 0
+        _check()
+        return self._pixels.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16], np.int32)
+
+    def _context(self, stage: int) -> mujoco.MjrContext:
+        if stage not in self._contexts:
+            self._contexts[stage] = self._stages[stage].context(*self._depth.shape)
+        return self._contexts[stage]
+
+    def _frames_for(self, stage: int, count: int) -> list[mujoco.MjvScene]:
+        frames = self._frames.setdefault(stage, [])
+        while len(frames) < count:
+            frames.append(self._stages[stage].new_frame())
+        return frames[:count]
+
+
+def _check() -> None:
+    code = mujoco.mjr_getError()
+    if code:
+        raise _ContextLost(f"GL error {code:#x}")
+
+
+def _metres(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Distances of a reversed depth buffer (1 at the near plane, 0 at the far one), float32 [H, W]."""
+    return (near * far / (near + depth.astype(float) * (far - near))).astype(np.float32)
+
+
+class _Thread:
+    """A thread that runs calls one after the other until it is stopped."""
+
+    def __init__(self, painter: _Painter) -> None:
+        self.painter = painter
+        self._calls: queue.SimpleQueue[tuple[Future, Callable[..., Any], tuple] | None] = queue.SimpleQueue()
+        # A daemon: at exit, Python waits for the other kind before it lets anyone close a renderer.
+        self._thread = threading.Thread(target=self._loop, name="vecenv-gl", daemon=True)
+        self._thread.start()
+
+    def run(self, call: Callable[..., Any], *arguments: Any) -> Future:
+        """Call in this thread."""
+        future: Future = Future()
+        self._calls.put((future, call, arguments))
+        return future
+
+    def stop(self) -> None:
+        """Free what the painter holds, and end."""
+        self._calls.put(None)
+        self._thread.join()
+
+    def _loop(self) -> None:
+        while (call := self._calls.get()) is not None:
+            _answer(*call)
+        self.painter.close()
+
+
+def _answer(future: Future, call: Callable[..., Any], arguments: Iterable[Any]) -> None:
+    try:
+        future.set_result(call(*arguments))
+    except BaseException as error:
+        future.set_exception(error)
+
+
+_live: weakref.WeakSet[GlRenderer] = weakref.WeakSet()
+
+
+@functools.cache
+def _close_at_exit() -> None:
+    """Close what is open at exit: called once there is a context, to come before PyOpenGL ends its display."""
+    atexit.register(_close_all)
+
+
+def _close_all() -> None:
+    for renderer in list(_live):
+        renderer.close()

@@ -1,0 +1,249 @@
+"""What a picture is taken of and with, as data: cameras, what may look different in a slot, and how to render.
+
+Nothing here draws. ``RenderConfig`` goes into ``vecenv.make``; ``UserCamera`` adds a viewpoint; ``VisualOptions``
+changes light, viewpoint, colours and textures of one slot, and ``VisualVariation.draw`` makes one from a seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+# Names that policies use for MuJoCo's cameras.
+ALIASES: Mapping[str, str] = MappingProxyType({"wrist": "robot0_eye_in_hand"})
+# The two that VLA policies are trained on, in their order.
+POLICY_CAMERAS = ("agentview", "wrist")
+LODS = ("original", "exact", "fast")
+ENGINES = ("gl", "raytrace")
+COLORS = ("published", "current")
+# MuJoCo's framebuffer and most drivers end here.
+LARGEST_SIDE = 4096
+
+
+class RenderError(ValueError):
+    """A camera, instance, texture or option that does not exist; the message names it and what there is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UserCamera:
+    """A viewpoint of one's own; poses are in the world frame and may differ between slots.
+
+    Attributes:
+        name: how images name it; must not be that of a camera of the scene.
+        pos: metres, [3] or [B, 3].
+        quat: wxyz, [4] or [B, 4]; a camera looks along its -z axis, +y is up.
+        fovy: vertical field of view, degrees, one number or [B].
+    """
+
+    name: str
+    pos: Any
+    quat: Any
+    fovy: Any = 45.0
+
+    def __post_init__(self) -> None:
+        for field_name, width in (("pos", 3), ("quat", 4)):
+            value = np.asarray(getattr(self, field_name), float)
+            if value.ndim not in (1, 2) or value.shape[-1] != width or not np.isfinite(value).all():
+                raise RenderError(f"camera {self.name!r}: {field_name} must be finite [{width}] or [B, {width}]")
+        if (np.linalg.norm(np.asarray(self.quat, float), axis=-1) < 1e-6).any():
+            raise RenderError(f"camera {self.name!r}: quat has length 0")
+        if not ((np.asarray(self.fovy) > 0) & (np.asarray(self.fovy) < 180)).all():
+            raise RenderError(f"camera {self.name!r}: fovy={self.fovy}: need degrees between 0 and 180")
+
+    @classmethod
+    def looking_at(cls, name: str, eye: Any, target: Any, up: Any = (0, 0, 1), fovy: Any = 45.0) -> UserCamera:
+        """A camera at ``eye`` [3] that looks at ``target`` [3], both in metres."""
+        back = np.asarray(eye, float) - np.asarray(target, float)
+        right = np.cross(np.asarray(up, float), back)
+        if np.linalg.norm(right) < 1e-9:
+            raise RenderError(f"camera {name!r}: looks along its up direction, or at itself")
+        axes = np.stack([_unit(right), _unit(np.cross(back, right)), _unit(back)], axis=1)
+        return cls(name=name, pos=np.asarray(eye, float), quat=quat_of(axes), fovy=fovy)
+
+    def in_slot(self, slot: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Position [3], axes in columns [3, 3] and field of view in degrees, in one slot."""
+
+        def own(value: Any, dims: int) -> np.ndarray:
+            array = np.asarray(value, float)
+            return array if array.ndim == dims else array[slot]
+
+        return own(self.pos, 1), matrix_of(own(self.quat, 1)), float(own(self.fovy, 0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraShift:
+    """Moves a camera in its own frame (x right, y up, looking along -z).
+
+    Attributes:
+        pos: metres, [3].
+        turn: rotation vector, radians, [3].
+        fovy: added to the vertical field of view, degrees.
+    """
+
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    fovy: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VisualOptions:
+    """How one slot looks different from upstream; physics and goals never notice. The default changes nothing.
+
+    Attributes:
+        light: scale of all light, 1 leaves it.
+        light_color: scale of red, green and blue light, [3].
+        light_shift: moves the lamps, metres, world frame, [3].
+        cameras: by camera, how it is moved.
+        colors: by instance (an object, a fixture, ``"robot"``) or material, what its red, green, blue are scaled by.
+        textures: by material, the texture of the scene it wears.
+    """
+
+    light: float = 1.0
+    light_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    light_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    cameras: Mapping[str, CameraShift] = field(default_factory=dict)
+    colors: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    textures: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VisualVariation:
+    """How far visual options may stray; ``draw`` picks one of them.
+
+    Attributes:
+        light: the light's scale lies within 1 plus or minus this.
+        light_color: each colour's scale likewise.
+        light_shift: largest shift of the lamps along each axis, metres.
+        camera_pos: largest shift of a camera along each axis, metres.
+        camera_turn: largest rotation of a camera about each axis, radians.
+        camera_fovy: largest change of the field of view, degrees.
+        cameras: the cameras that move.
+        color: scales of the instances' red, green, blue lie within 1 plus or minus this.
+        instances: the instances that change colour.
+        textures: by material, the textures it may wear.
+    """
+
+    light: float = 0.0
+    light_color: float = 0.0
+    light_shift: float = 0.0
+    camera_pos: float = 0.0
+    camera_turn: float = 0.0
+    camera_fovy: float = 0.0
+    cameras: Sequence[str] = ("agentview",)
+    color: float = 0.0
+    instances: Sequence[str] = ()
+    textures: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def draw(self, seed: int | Sequence[int]) -> VisualOptions:
+        """Options that depend on the seed alone; give (seed, episode), say, to vary by episode."""
+        rng = np.random.default_rng(seed)
+
+        def around(center: float, spread: float) -> tuple[float, float, float]:
+            x, y, z = rng.uniform(center - spread, center + spread, 3).tolist()
+            return x, y, z
+
+        return VisualOptions(
+            light=around(1.0, self.light)[0],
+            light_color=around(1.0, self.light_color),
+            light_shift=around(0.0, self.light_shift),
+            cameras={
+                name: CameraShift(
+                    pos=around(0.0, self.camera_pos),
+                    turn=around(0.0, self.camera_turn),
+                    fovy=around(0.0, self.camera_fovy)[0],
+                )
+                for name in self.cameras
+            },
+            colors={name: around(1.0, self.color) for name in self.instances},
+            textures={name: str(rng.choice(list(choices))) for name, choices in self.textures.items()},
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderConfig:
+    """How an environment renders.
+
+    Attributes:
+        height, width: of every image, pixels.
+        lod: ``"exact"``, upstream's picture to within what can be seen; ``"original"``, with every triangle that
+            upstream draws; or ``"fast"``, simplified meshes (``vecenv.libero.render.lod``).
+        cameras: cameras besides those of the scene.
+        gl: ``"egl"``, ``"osmesa"``, or None for what ``MUJOCO_GL`` says, else the first of them that works.
+        engine: ``"gl"``, upstream's renderer; or ``"raytrace"``, MuJoCo Warp's, which needs no GL and is fast on NVIDIA
+            GPUs; its pictures differ a little, and of visual options it swaps no textures and colours no materials.
+        num_threads: rendering threads, each with a GL context; None for one a core.
+        colors: ``"published"``, textures as MuJoCo up to 3.3.2 shows them, under which LIBERO's demonstrations were
+            rendered and its checkpoints scored; or ``"current"``, as the installed MuJoCo shows them
+            (``vecenv.libero.render.colors`` says what differs).
+    """
+
+    height: int = 256
+    width: int = 256
+    lod: str = "exact"
+    cameras: Sequence[UserCamera] = ()
+    gl: str | None = None
+    engine: str = "gl"
+    num_threads: int | None = None
+    colors: str = "published"
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.height <= LARGEST_SIDE and 1 <= self.width <= LARGEST_SIDE):
+            raise RenderError(f"images of {self.height} x {self.width} pixels: each side must be 1 to {LARGEST_SIDE}")
+        if self.lod not in LODS:
+            raise RenderError(f"lod={self.lod!r}: expected one of {', '.join(LODS)}")
+        if self.engine not in ENGINES:
+            raise RenderError(f"engine={self.engine!r}: expected one of {', '.join(ENGINES)}")
+        check_colors(self.colors)
+        if self.num_threads is not None and self.num_threads < 1:
+            raise RenderError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) != len(names):
+            raise RenderError(f"two cameras have the same name: {', '.join(names)}")
+
+
+def check_colors(colors: str) -> None:
+    """See that these are colours that there are.
+
+    Raises:
+        RenderError: they are not; the message names those that are.
+    """
+    if colors not in COLORS:
+        raise RenderError(f"colors={colors!r}: expected one of {', '.join(COLORS)}")
+
+
+def matrix_of(quat: np.ndarray) -> np.ndarray:
+    """Rotation matrix [3, 3] of a quaternion wxyz [4] of any length but 0."""
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quat_of(matrix: np.ndarray) -> np.ndarray:
+    """Quaternion wxyz [4] of a rotation matrix [3, 3]."""
+    import mujoco
+
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(matrix, float).ravel())
+    return quat
+
+
+def rotation_of(vector: Sequence[float]) -> np.ndarray:
+    """Rotation matrix [3, 3] of a rotation vector [3], radians."""
+    turn = np.asarray(vector, float)
+    angle = float(np.linalg.norm(turn))
+    if angle == 0.0:
+        return np.eye(3)
+    return matrix_of(np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * turn / angle]))
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)

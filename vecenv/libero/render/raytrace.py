@@ -1,0 +1,437 @@
+"""Pictures of worlds by ray tracing inside ``jax.jit``: MuJoCo Warp's renderer, on NVIDIA GPUs, without GL.
+
+In: a scenery (``vecenv.libero.render.scenery``) and, for each world, the poses of its bodies as MJX keeps them. Out:
+images of one or several cameras, as delivered everywhere in vecenv: rows from the top, mirrored. ``RayTracer.look`` is
+a function of one world for ``vmap``, ``jit`` and ``scan``; all worlds it is mapped over share one render context, which
+is made when such a batch is first traced. On a CPU the same code runs, slowly.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx.warp import render_context
+
+from vecenv.libero.render.drawing import Pose, View
+from vecenv.libero.render.gl import Frames, Shot, Wanted
+from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, UserCamera, VisualOptions
+from vecenv.libero.render.ray_kernel import HEADLIGHT, make_kernel
+from vecenv.libero.render.scenery import Scenery, drawn_colors, installed_scenery
+from vecenv.libero.scene.bddl import Problem
+from vecenv.util.mapped import Sized
+from vecenv.util.rotations import quat_to_mat
+
+# Threads of a block on the GPU, registers of a thread, and the tile of pixels, rows and columns, that threads next to
+# each other trace: rays that travel together are faster. Measured on an H200, benchmarks/render_gpu.py.
+BLOCK, REGISTERS, TILE = 128, 96, (8, 8)
+
+
+class Seen(NamedTuple):
+    """Images of C cameras of one world; what was not asked for is None.
+
+    Attributes:
+        rgb: uint8 [C, H, W, 3].
+        depth: metres from the camera's plane, 0 where nothing is, float32 [C, H, W].
+        segmentation: index into the scenery's ``instances``, int16 [C, H, W].
+    """
+
+    rgb: jax.Array | None
+    depth: jax.Array | None
+    segmentation: jax.Array | None
+
+
+class Style(NamedTuple):
+    """How one world with C cameras and a scenery of I instances is looked at, and how it looks; see ``plain_style``.
+
+    Attributes:
+        light: scale of red, green and blue light, [3].
+        lamps: moves all lamps, metres, world frame, [3].
+        colors: scale of red, green, blue of each of the scenery's ``instances``, [I, 3].
+        pos, turn: move each camera, metres [C, 3], and turn it [C, 3, 3], in its own frame (x right, y up, looking
+            along -z); those of a free camera are its pose in the world.
+        fovy: vertical field of view of each camera, degrees, [C].
+    """
+
+    light: Any
+    lamps: Any
+    colors: Any
+    pos: Any
+    turn: Any
+    fovy: Any
+
+
+class RayTracer:
+    """The cameras of a scenery.
+
+    Args:
+        scenery: what there is to see.
+        height, width: of the images, pixels.
+        cameras: which cameras, in the order of the images; ``"wrist"`` is another name of ``"robot0_eye_in_hand"``, and
+            None is a free camera, which a ``Style`` puts somewhere.
+        rgb, depth, segmentation: which images ``look`` makes.
+        samples: rays a pixel along each side, averaged; GL takes four a pixel. Two cost four times as much.
+        block_dim: threads of a block on the GPU.
+        tile: most rows and columns of pixels that neighbouring threads trace; ``(1, 1)`` for row by row.
+        registers: most registers of a thread on the GPU; 0 leaves it to the compiler.
+        culling: whether faces are seen from their front only, as GL shows them; without, images are 7 % faster.
+
+    Raises:
+        RenderError: the scenery has no such camera.
+    """
+
+    def __init__(
+        self,
+        scenery: Scenery,
+        *,
+        height: int = 256,
+        width: int = 256,
+        cameras: Sequence[str | None] = POLICY_CAMERAS,
+        rgb: bool = True,
+        depth: bool = False,
+        segmentation: bool = False,
+        samples: int = 1,
+        block_dim: int = BLOCK,
+        tile: tuple[int, int] = TILE,
+        registers: int = REGISTERS,
+        culling: bool = True,
+    ) -> None:
+        self.scenery, self.height, self.width, self.cameras = scenery, height, width, tuple(cameras)
+        self._wanted = rgb, depth, segmentation
+        self._model = model = scenery.model
+        self._camera_ids = [0 if name is None else _camera(model, name) for name in cameras]
+        self._is_free = np.array([name is None for name in cameras])
+        self._put = mjx.put_model(model, impl="warp")
+        sizes = self._put._impl.block_dim.__class__(render=block_dim)
+        self._put = self._put.tree_replace({"_impl.block_dim": sizes}).replace(**_lamps(model))
+        self._tile = math.gcd(height, tile[0]), math.gcd(width, tile[1])
+        self._blank = mjx.make_data(model, impl="warp", naconmax=1, njmax=1)
+        self._options = {"samples_per_pixel": samples, "enable_backface_culling": culling}
+        self._registers = registers
+        self._contexts: dict[int, Any] = {}
+        self._look = Sized(self._look_at, self._context)
+
+    @property
+    def plain_style(self) -> Style:
+        """The style that changes nothing; a free camera is at the world's origin and looks down, with 45 degrees."""
+        count = len(self.cameras)
+        fovy = np.where(self._is_free, 45.0, self._model.cam_fovy[self._camera_ids])
+        return Style(
+            light=np.ones(3, np.float32),
+            lamps=np.zeros(3, np.float32),
+            colors=np.ones((len(self.scenery.instances), 3), np.float32),
+            pos=np.zeros((count, 3), np.float32),
+            turn=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
+            fovy=fovy.astype(np.float32),
+        )
+
+    def look(self, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array, style: Style | None = None) -> Seen:
+        """What the cameras of one world see.
+
+        Args:
+            xpos: positions of the bodies of the physics model, world frame, metres, [nbody, 3].
+            xquat: their orientations, wxyz, [nbody, 4].
+            qpos: [nq], read for what glows while a joint is turned.
+            style: how it looks; None for ``plain_style``.
+        """
+        return self._look(xpos, xquat, qpos) if style is None else self._look(xpos, xquat, qpos, style)
+
+    def _context(self, num_worlds: int) -> Any:
+        if num_worlds not in self._contexts:
+            rgb, depth, segmentation = self._wanted
+            with jax.ensure_compile_time_eval():
+                context = mjx.create_render_context(
+                    self._model,
+                    nworld=num_worlds,
+                    cam_res=(self.width, self.height),
+                    cam_active=self._camera_ids,
+                    render_rgb=rgb,
+                    render_depth=depth,
+                    render_seg=segmentation,
+                    enabled_geom_groups=[1],
+                    **self._options,
+                )
+                rays = render_context.get(context.pytree())
+                self._tile_rays(rays)
+                rays._megakernel = make_kernel(self._model, rays, self._registers)
+                self._contexts[num_worlds] = context
+        return self._contexts[num_worlds].pytree()
+
+    def _tile_rays(self, context: Any) -> None:
+        """Put a render context's rays, which are row by row for each camera and sample, into the order of tiles."""
+        (rows, columns), rays = self._tile, context.ray.numpy()
+        tiled = rays.reshape(-1, self.height // rows, rows, self.width // columns, columns, 3).swapaxes(2, 3)
+        context.ray.assign(np.ascontiguousarray(tiled).reshape(rays.shape))
+
+    def _image(self, buffer: jax.Array) -> jax.Array:
+        """Images [C, H, W, ...] as delivered, of a buffer [C * H * W, ...] in the order of tiles."""
+        (rows, columns), rest = self._tile, buffer.shape[1:]
+        tiles = buffer.reshape(-1, self.height // rows, self.width // columns, rows, columns, *rest)
+        return tiles.swapaxes(2, 3).reshape(-1, self.height, self.width, *rest)[:, :, ::-1]
+
+    def _look_at(
+        self, context: Any, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array, style: Style | None = None
+    ) -> Seen:
+        style = self.plain_style if style is None else style
+        model = self._put.replace(geom_rgba=self._colors(qpos, style), cam_fovy=self._widths(style))
+        model = model.replace(
+            light_ambient=self._put.light_ambient * style.light,
+            light_diffuse=self._put.light_diffuse * style.light,
+            light_specular=self._put.light_specular * style.light,
+        )
+        data = mjx.refit_bvh(model, self._posed(xpos, xquat, style), context)
+        if self._wanted[2]:
+            rgb, depth, segmentation, _ = mjx.render_with_segmentation(model, data, context)
+            return self._delivered(rgb, depth, segmentation)
+        rgb, depth, _ = mjx.render(model, data, context)
+        return self._delivered(rgb, depth, None)
+
+    def _posed(self, xpos: jax.Array, xquat: jax.Array, style: Style) -> mjx.Data:
+        model, chosen = self._model, self._camera_ids
+        mats = jax.vmap(quat_to_mat)(xquat.astype(jnp.float32))
+        xpos = xpos.astype(jnp.float32)
+
+        def place(body: np.ndarray, pos: np.ndarray, own: np.ndarray) -> tuple[jax.Array, jax.Array]:
+            turn = mats[body]
+            return xpos[body] + _times(turn, jnp.asarray(pos, jnp.float32)[..., None])[..., 0], _times(
+                turn, jnp.asarray(own, jnp.float32)
+            )
+
+        free = self._is_free[:, None]
+        bodies = np.where(self._is_free, 0, model.cam_bodyid[chosen])
+        own_pos = np.where(free, 0.0, model.cam_pos[chosen])
+        own_mat = np.where(free[..., None], np.eye(3), _matrices(model.cam_quat[chosen]))
+        geom_xpos, geom_xmat = place(model.geom_bodyid, model.geom_pos, _matrices(model.geom_quat))
+        cam_xpos, cam_xmat = place(bodies, own_pos, own_mat)
+        light_xpos, light_xdir = place(model.light_bodyid, model.light_pos, model.light_dir[..., None])
+        spare = jnp.zeros((self._put.light_type.shape[0] - model.nlight, 3))
+        return self._blank.tree_replace(
+            {
+                "geom_xpos": geom_xpos,
+                "geom_xmat": geom_xmat,
+                "cam_xpos": cam_xpos + _times(cam_xmat, jnp.asarray(style.pos)[..., None])[..., 0],
+                "cam_xmat": _times(cam_xmat, jnp.asarray(style.turn)),
+                "_impl.light_xpos": jnp.concatenate([light_xpos + style.lamps, spare]),
+                "_impl.light_xdir": jnp.concatenate([light_xdir[..., 0], spare]),
+            }
+        )
+
+    def _widths(self, style: Style) -> jax.Array:
+        """How much wider cameras see than those that the contexts' rays are of."""
+        half = np.tan(np.deg2rad(self._model.cam_fovy[self._camera_ids]) / 2)
+        return jnp.tan(jnp.deg2rad(jnp.asarray(style.fovy)) / 2) / jnp.asarray(half, jnp.float32)
+
+    def _colors(self, qpos: jax.Array, style: Style) -> jax.Array:
+        """Colours of the geoms; what does not glow has alpha 0, which rays pass."""
+        rgba = jnp.asarray(drawn_colors(self._model))
+        rgba = rgba.at[:, :3].multiply(jnp.asarray(style.colors)[self.scenery.instance_of_geom])
+        for burner in self.scenery.burners:
+            turned = burner.sign * qpos[np.array(burner.knobs)]
+            is_on = (turned >= burner.bound if burner.inclusive else turned > burner.bound).any()
+            rgba = rgba.at[burner.geom, 3].set(jnp.where(is_on, rgba[burner.geom, 3], 0.0))
+        return rgba
+
+    def _delivered(self, rgb: jax.Array, depth: jax.Array, segmentation: jax.Array | None) -> Seen:
+        """Of the renderer's flat buffers of all cameras."""
+        wants_rgb, wants_depth, _ = self._wanted
+        return Seen(
+            rgb=_unpacked(self._image(rgb.reshape(-1))) if wants_rgb else None,
+            depth=self._image(depth.reshape(-1)) if wants_depth else None,
+            segmentation=None if segmentation is None else self._instances(self._image(segmentation.reshape(-1, 2))),
+        )
+
+    def _instances(self, codes: jax.Array) -> jax.Array:
+        """Of the geom and object type [..., 2] of each pixel."""
+        table = jnp.asarray(np.append(self.scenery.instance_of_geom, np.int16(0)))
+        return table[codes[..., 0]]  # -1 is nothing, the table's last
+
+
+class RayRenderer:
+    """Renders batches as ``vecenv.libero.render.gl.GlRenderer`` does, without GL: one call of ``RayTracer`` for each
+    scene.
+
+    Args:
+        config: sizes, level of detail and cameras of one's own.
+    """
+
+    def __init__(self, config: RenderConfig) -> None:
+        self._config = config
+        self._own = {camera.name: camera for camera in config.cameras}
+        self._looks: dict[tuple, tuple[RayTracer, Any]] = {}
+
+    def render(
+        self,
+        shots: Sequence[Shot],
+        problems: Sequence[Problem],
+        models: Sequence[mujoco.MjModel],
+        cameras: Sequence[str],
+        wanted: Wanted,
+    ) -> Frames:
+        """Render every slot through every camera.
+
+        Args:
+            shots: one a slot; their stages count through ``problems``.
+            problems, models: the scenes and their physics models.
+            cameras: names of the scenes' cameras or of the configuration's.
+            wanted: which images.
+
+        Raises:
+            RenderError: a scene has no such camera or instance, or a slot's options swap textures or colour materials.
+        """
+        size = (len(shots), self._config.height, self._config.width)
+        rgb = {name: np.zeros((*size, 3), np.uint8) for name in cameras if wanted.rgb}
+        depth = {name: np.zeros(size, np.float32) for name in cameras if wanted.depth}
+        segmentation = {name: np.zeros(size, np.int16) for name in cameras if wanted.segmentation}
+        for stage, (problem, model) in enumerate(zip(problems, models, strict=True)):
+            slots = [slot for slot, shot in enumerate(shots) if shot.stage == stage]
+            tracer, look = self._look(problem, tuple(cameras), wanted)
+            styles = self._styles(tracer, cameras, slots, [shots[slot].options for slot in slots])
+            seen = look(*_states(model, [shots[slot].pose for slot in slots]), *styles)
+            for images, made in ((rgb, seen.rgb), (depth, seen.depth), (segmentation, seen.segmentation)):
+                for number, name in enumerate(cameras if images else ()):
+                    images[name][slots] = np.asarray(made[:, number])
+        return Frames(rgb, depth, segmentation, {})
+
+    def close(self) -> None:
+        """Forget what was compiled. Closing twice is harmless."""
+        self._looks = {}
+
+    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> tuple[RayTracer, Any]:
+        key = (problem.scene_key(), cameras, wanted)
+        if key not in self._looks:
+            tracer = RayTracer(
+                installed_scenery(problem, self._config.lod, self._config.colors),
+                height=self._config.height,
+                width=self._config.width,
+                cameras=[None if name in self._own else name for name in cameras],
+                rgb=wanted.rgb,
+                depth=wanted.depth,
+                segmentation=wanted.segmentation,
+            )
+            self._looks[key] = tracer, jax.jit(jax.vmap(tracer.look))
+        return self._looks[key]
+
+    def _styles(
+        self, tracer: RayTracer, cameras: Sequence[str], slots: Sequence[int], options: Sequence[VisualOptions]
+    ) -> tuple[Style, ...]:
+        """The slots' styles, stacked; none where nothing differs from the scene's own look."""
+        if all(name not in self._own for name in cameras) and all(each == VisualOptions() for each in options):
+            return ()
+        own = [[self._own.get(name, name) for name in cameras]] * len(slots)
+        styles = [style_of(tracer, *each) for each in zip(options, own, slots, strict=True)]
+        return (jax.tree.map(lambda *arrays: np.stack(arrays), *styles),)
+
+
+def style_of(tracer: RayTracer, options: VisualOptions, cameras: Sequence[str | UserCamera], slot: int) -> Style:
+    """The style of a slot's visual options, and of its cameras, which are the tracer's.
+
+    Raises:
+        RenderError: the options swap textures, or colour what is no instance of the scene.
+    """
+    if options.textures:
+        raise RenderError("engine='raytrace' swaps no textures; use engine='gl'")
+    style = tracer.plain_style
+    style.light[:] = options.light * np.asarray(options.light_color)
+    style.lamps[:] = options.light_shift
+    for name, color in options.colors.items():
+        if name not in tracer.scenery.instances[1:]:
+            there = ", ".join(tracer.scenery.instances[1:])
+            raise RenderError(f"engine='raytrace' colours instances only, and {name!r} is none; there are {there}")
+        style.colors[tracer.scenery.instances.index(name)] = color
+    for number, camera in enumerate(cameras):
+        view = View(style.pos[number], style.turn[number], float(style.fovy[number]))
+        name = camera.name if isinstance(camera, UserCamera) else camera
+        view = View(*camera.in_slot(slot)) if isinstance(camera, UserCamera) else view
+        shift = next((options.cameras[key] for key in _names(name) if key in options.cameras), None)
+        view = view if shift is None else view.shifted(shift)
+        style.pos[number], style.turn[number], style.fovy[number] = view.pos, view.mat, view.fovy
+    return style
+
+
+def _names(camera: str) -> tuple[str, ...]:
+    """All names of a camera."""
+    real = ALIASES.get(camera, camera)
+    return real, *(alias for alias, other in ALIASES.items() if other == real)
+
+
+def _lamps(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """What MJX knows of lamps, with the headlight as one more if it is on."""
+    head, colors = model.vis.headlight, ("ambient", "diffuse", "specular")
+    more = {
+        "type": HEADLIGHT,
+        "castshadow": False,
+        "active": True,
+        "attenuation": (1, 0, 0),
+        "cutoff": 45,
+        "exponent": 0,
+    }
+    more |= {name: getattr(head, name) for name in colors}
+    found = {}
+    for name, value in more.items():
+        own = getattr(model, f"light_{name}")
+        dtype = {np.dtype(np.float64): np.float32, np.dtype(np.uint8): bool}.get(own.dtype, own.dtype)
+        extra = np.array([value] if head.active else [], own.dtype).reshape(-1, *own.shape[1:])
+        found[f"light_{name}"] = np.concatenate([own, extra]).astype(dtype)
+    return found
+
+
+def _states(model: mujoco.MjModel, shown: Sequence[Pose]) -> tuple[np.ndarray, ...]:
+    qpos, body_pos, body_quat = (
+        np.stack([getattr(pose, name) for pose in shown]) for name in ("qpos", "body_pos", "body_quat")
+    )
+    return (*poses(model, qpos, body_pos, body_quat), qpos.astype(np.float32))
+
+
+def poses(
+    model: mujoco.MjModel, qpos: np.ndarray, body_pos: np.ndarray, body_quat: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the bodies of B worlds are, for ``RayTracer.look``, where no MJX computed it.
+
+    Args:
+        model: the physics model.
+        qpos: [B, nq].
+        body_pos, body_quat: poses of the bodies in their parents, [B, nbody, 3] and [B, nbody, 4].
+
+    Returns:
+        Positions [B, nbody, 3] and orientations wxyz [B, nbody, 4], world frame, float32.
+    """
+    own, data = copy.copy(model), mujoco.MjData(model)
+    xpos, xquat = np.zeros(body_pos.shape, np.float32), np.zeros(body_quat.shape, np.float32)
+    for world in range(len(qpos)):
+        own.body_pos[:], own.body_quat[:], data.qpos[:] = body_pos[world], body_quat[world], qpos[world]
+        mujoco.mj_kinematics(own, data)
+        xpos[world], xquat[world] = data.xpos, data.xquat
+    return xpos, xquat
+
+
+def _camera(model: mujoco.MjModel, name: str) -> int:
+    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, ALIASES.get(name, name))
+    if found < 0:
+        there = ", ".join(model.camera(index).name for index in range(model.ncam))
+        raise RenderError(f"no camera {name!r}; this scene has {there}")
+    return found
+
+
+def _matrices(quats: np.ndarray) -> np.ndarray:
+    """Rotation matrices [n, 3, 3] of quaternions wxyz [n, 4]."""
+    out = np.zeros((len(quats), 9))
+    for row, quat in zip(out, quats, strict=True):
+        mujoco.mju_quat2Mat(row, quat)
+    return out.reshape(-1, 3, 3)
+
+
+def _times(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Matrix products in full precision: GPUs round the factors of ``@`` to ten bits."""
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+
+
+def _unpacked(packed: jax.Array) -> jax.Array:
+    """uint8 [..., 3] of 0xAARRGGBB."""
+    return jnp.stack([(packed >> shift).astype(jnp.uint8) for shift in (16, 8, 0)], axis=-1)

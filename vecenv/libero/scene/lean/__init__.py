@@ -1,0 +1,1 @@
+"""Lean geometry: at most 24 collision geoms a scene, fitted to upstream's."""

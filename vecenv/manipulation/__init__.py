@@ -1,0 +1,1 @@
+"""Geometry of hands and objects: grasps, placing, routes. For VoxPoser and the scripted policies alike."""

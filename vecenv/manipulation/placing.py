@@ -1,0 +1,285 @@
+"""Where a hand with something in it goes to put that down: candidates, what each costs, and the height of rest.
+
+A :class:`~vecenv.manipulation.world.World` whose hand holds a thing and a :class:`Target` come in; the pose of the hand
+that lets go comes out (:func:`put_down`). Heights come from surface points: of the thing, of what it will rest on, and
+of what the open hand must not touch. :func:`choose_grasp` is the other end of a transfer: how to hold the thing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vecenv.manipulation.grasps import Grasps, Gripper, clearance, find_grasps, room_around
+from vecenv.manipulation.world import Margins, World, around, down_facing, leaning, spun, upright, yaw
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where an object's origin may go.
+
+    Attributes:
+        xy: candidates, world frame, [M, 2].
+        cost: what each costs, ascending, [M].
+        floor: height that carries it whatever the points say, metres.
+        ignored: things whose points are no obstacle.
+        centre, half: a box to fit in, horizontally, [2] each; None where there is none.
+        entry: the way out of a space that is entered from a side, horizontal unit vector [3]; None for one that is
+            entered from above.
+        roof: height of the underside of what covers such a space, metres.
+    """
+
+    xy: np.ndarray
+    cost: np.ndarray
+    floor: float
+    ignored: tuple[str, ...] = ()
+    centre: np.ndarray | None = None
+    half: np.ndarray | None = None
+    entry: np.ndarray | None = None
+    roof: float = np.inf
+
+
+@dataclass(frozen=True)
+class Grasped:
+    """The grasp a pick was planned with.
+
+    Attributes:
+        pos: of the grip site, [3].
+        rotation: of the hand, [3, 3].
+        width: thickness of what is held, metres.
+        narrow: the fingers go in half closed.
+    """
+
+    pos: np.ndarray
+    rotation: np.ndarray
+    width: float
+    narrow: bool = False
+
+
+def choose_grasp(world: World, name: str, failed: Sequence[np.ndarray] = (), *, narrow: bool = True) -> Grasped | None:
+    """The best grasp of an object among its neighbours, or None when it offers nothing to hold.
+
+    The open hand is tried first, pointing down; where neighbours leave it no room, the hand with half-closed fingers
+    and the hand that leans to some side.
+
+    Args:
+        world: the scene.
+        name: the object.
+        failed: positions of grasps that were tried in vain, relative to the object's origin, world axes.
+        narrow: the fingers may go in half closed; False where they can only be opened and closed.
+    """
+    wide = _best_grasp(world, name, failed, world.config.gripper)
+    if wide is not None and wide[1] > world.config.least_room:
+        return wide[0]
+    half_closed = narrow and _best_grasp(world, name, failed, world.config.gripper.narrowed(world.config.narrow))
+    for tilt in world.config.grasp_tilts if wide is None or wide[1] < 0 else ():
+        leant = _tilted_grasp(world, name, failed, tilt)
+        if leant is not None:
+            return leant
+    found = [option for option in (wide, half_closed) if option]
+    return max(found, key=lambda option: option[1])[0] if found else None
+
+
+def _best_grasp(
+    world: World, name: str, failed: Sequence[np.ndarray], gripper: Gripper
+) -> tuple[Grasped, float] | None:
+    """The best grasp of a hand opened so far, and its room."""
+    config = world.config
+    cloud = world.snapshot.objects[name]
+    grasps = find_grasps(cloud.points, cloud.normals, gripper)
+    if not len(grasps):
+        return None
+    others = np.concatenate([world.others(name), world.walls])
+    near = around(cloud.points.mean(axis=0)[:2], others, config.neighbours)
+    room = clearance(grasps, near, gripper)
+    rotations = down_facing(grasps.axis)
+    score = grasps.score + np.minimum(room, config.ample_room) / config.room_scale
+    lacking = np.maximum(config.least_room - room, 0.0)
+    score = score - np.where(lacking > 0, 10.0 + lacking / config.lack_scale, 0.0)
+    score = score - np.abs(yaw(rotations)) / config.turn_scale - _reach_cost(world, grasps.pos)
+    origin = world.snapshot.poses[name][:3]
+    for pos in failed:
+        score = score - 5.0 * (np.linalg.norm(grasps.pos - origin - pos, axis=1) < config.retry_radius)
+    best = int(score.argmax())
+    narrow = gripper.half_opening < config.gripper.half_opening
+    return Grasped(grasps.pos[best], rotations[best], float(grasps.width[best]), narrow), float(room[best])
+
+
+def _tilted_grasp(world: World, name: str, failed: Sequence[np.ndarray], tilt: float) -> Grasped | None:
+    """The best grasp with room of a hand that leans so far to one of eight sides, radians; None if there is none.
+
+    In the frame of such a hand it points down, so that everything is as for an upright one.
+    """
+    config, cloud = world.config, world.snapshot.objects[name]
+    middle = cloud.points.mean(axis=0)
+    near = around(middle[:2], np.concatenate([world.others(name), world.walls]), config.neighbours)
+    near = np.concatenate([near, _table_under(world, middle)])
+    best, highest = None, -np.inf
+    for heading in np.arange(8) * np.pi / 4:
+        frame = spun(leaning(tilt), heading) @ spun(np.eye(3), -heading)
+        grasps = find_grasps(cloud.points @ frame, cloud.normals @ frame, config.gripper)
+        room = clearance(grasps, near @ frame, config.gripper)
+        rotations = frame @ down_facing(grasps.axis)
+        pos = grasps.pos @ frame.T
+        score = grasps.score + np.minimum(room, config.ample_room) / config.room_scale
+        score = score - np.abs(yaw(rotations)) / config.turn_scale - _reach_cost(world, pos)
+        for place in failed:
+            tried = np.linalg.norm(pos - world.snapshot.poses[name][:3] - place, axis=1) < config.retry_radius
+            score = score - 5.0 * tried
+        score = np.where(room > config.least_room, score, -np.inf)
+        i = int(score.argmax()) if len(score) else -1
+        if i >= 0 and score[i] > highest:
+            best, highest = Grasped(pos[i], rotations[i], float(grasps.width[i])), float(score[i])
+    return best
+
+
+def _table_under(world: World, middle: np.ndarray) -> np.ndarray:
+    """Points 1 cm apart on the table around a place, [N, 3]: of the whole scene's samples too few lie there."""
+    ticks = np.arange(-0.16, 0.161, 0.01)
+    x, y = np.meshgrid(ticks, ticks)
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, world.ground(middle[:2]))], axis=1) + [*middle[:2], 0.0]
+
+
+def _reach_cost(world: World, pos: np.ndarray) -> np.ndarray:
+    if world.base is None:
+        return np.zeros(len(pos))
+    far = np.linalg.norm(pos[:, :2] - world.base, axis=1) - world.config.easy_reach
+    return np.maximum(far, 0) / world.config.reach_scale
+
+
+def carry_height(world: World, name: str, hand: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
+    """Height of the hand at which an object held at ``hand`` passes over everything between two places."""
+    hangs = hand[2] - min(world.points(name)[:, 2].min(), hand[2] - world.config.gripper.tip)
+    return world.tallest(start, end, name) + hangs + world.config.over_obstacles
+
+
+def put_down(world: World, name: str, target: Target) -> tuple[np.ndarray, np.ndarray]:
+    """Position [3] and rotation [3, 3] of the hand when it lets go."""
+    if target.entry is not None:
+        return put_in(world, name, target, target.entry)
+    rotation = upright(world.hand_rotation) if world.hand_rotation[2, 2] < -0.98 else world.hand_rotation
+    best, lowest = (world.hand, rotation), np.inf
+    for angle in _turns(world, name, target, rotation):
+        for xy, cost in zip(target.xy, target.cost + abs(angle) / world.config.turn_scale, strict=True):
+            if cost >= lowest:  # costs ascend and nothing makes them less
+                break
+            end, extra = _put_down_at(world, name, target, xy, angle)
+            if cost + extra < lowest:
+                best, lowest = (end, spun(rotation, angle)), cost + extra
+    return best
+
+
+def put_in(world: World, name: str, target: Target, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Likewise into a space that is entered from a side: the fingers lead, and the thing turns along with the hand.
+
+    Args:
+        world: the scene.
+        name: the thing held.
+        target: a space with a box to fit in.
+        out: the way out of it, horizontal unit vector [3].
+    """
+    config = world.config
+    obstacles = np.concatenate([world.others(name), world.walls])
+    obstacles = obstacles[np.linalg.norm(obstacles[:, :2] - target.xy[0], axis=1) < 2 * config.neighbours]
+    best, highest = (world.hand, world.hand_rotation), -np.inf
+    for rotation in _entering(out, config):
+        pos, room = _put_in_at(world, name, target, rotation, obstacles)
+        ways = [pos + back * out for back in (0.0, 0.05, 0.10)]
+        free = min(room, *(room_around(way, rotation, obstacles, config.gripper) for way in ways))
+        turned = np.arccos(np.clip((np.trace(rotation @ world.hand_rotation.T) - 1) / 2, -1, 1))
+        score = min(free, config.ample_room) / config.room_scale - turned / config.turn_scale
+        if score > highest:
+            best, highest = (pos, rotation), score
+    return best
+
+
+def _entering(out: np.ndarray, config: Margins) -> list[np.ndarray]:
+    """Hands that lead with their fingers against ``out``: how level they are, and the four turns about their axis."""
+    side = np.cross([0.0, 0.0, 1.0], out)
+    hands = []
+    for tilt in config.entry_tilts:
+        z = -np.sin(tilt) * out - np.cos(tilt) * np.array([0.0, 0.0, 1.0])
+        across = np.cross(z, side)
+        hands += [np.stack([np.cross(y, z), y, z], axis=1) for y in (side, -side, across, -across)]
+    return hands
+
+
+def _put_in_at(
+    world: World, name: str, target: Target, rotation: np.ndarray, obstacles: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Position of a hand so turned [3] that lets the thing stand in the middle of a space; what room there is over it.
+
+    The hand's own size may ask for more height than the thing's.
+    """
+    config = world.config
+    hung = (world.points(name) - world.hand) @ (rotation @ world.hand_rotation.T).T
+    low, high = hung.min(axis=0), hung.max(axis=0)
+    height = target.floor + config.touchdown - low[2]
+    pos = np.append(target.xy[0] - (low + high)[:2] / 2, height)
+    lifts = np.arange(0.0, max(target.roof - high[2] - height, 0.0) + 0.005, 0.01)
+    rooms = [room_around(pos + [0.0, 0.0, lift], rotation, obstacles, config.gripper) for lift in lifts]
+    enough = np.flatnonzero(np.array(rooms) > config.least_room)
+    lift = float(lifts[int(enough[0]) if len(enough) else int(np.argmax(rooms))])
+    return pos + [0.0, 0.0, lift], target.roof - (height + lift + float(high[2]))
+
+
+def _turns(world: World, name: str, target: Target, rotation: np.ndarray) -> list[float]:
+    """Angles by which the hand may turn what it holds: none, and those that align it with a box it must fit in."""
+    if target.half is None:
+        return [0.0]
+    spread = world.points(name)[:, :2] - world.points(name)[:, :2].mean(axis=0)
+    _, vectors = np.linalg.eigh(spread.T @ spread)
+    aligned = -np.arctan2(vectors[1, 1], vectors[0, 1]) + np.arange(-2, 3) * np.pi / 2
+    now = float(yaw(rotation))
+    return [0.0, *(float(angle) for angle in aligned if abs(now + angle) < world.config.widest_turn)]
+
+
+def _put_down_at(world: World, name: str, target: Target, xy: np.ndarray, angle: float) -> tuple[np.ndarray, float]:
+    """Position of the hand [3] that puts the origin over ``xy``, turned by ``angle``; and what that costs."""
+    config = world.config
+    turn = spun(np.eye(3), angle)
+    middle = xy - (turn @ (world.snapshot.poses[name][:3] - world.hand))[:2]
+    moved = (world.points(name) - world.hand) @ turn.T + np.append(middle, world.hand[2])
+    near, walls = (
+        around(middle, cloud, config.neighbours) for cloud in (world.others(name, *target.ignored), world.walls)
+    )
+    resting = world.hand[2] + _rest(moved, near, target.floor, config)
+    axis = (turn @ upright(world.hand_rotation))[:, 1]
+    height = _with_room(np.append(middle, resting), axis, np.concatenate([near, walls]), config)
+    sits = resting - world.hand[2] + world.points(name)[:, 2].min() - target.floor
+    cost = (
+        config.high_cost * max(sits, 0.0)
+        + config.drop_cost * (height - resting)
+        + _overhang(moved, target) / config.overhang_scale
+    )
+    return np.append(middle, height), cost
+
+
+def _overhang(points: np.ndarray, target: Target) -> float:
+    """How far points stick out of the box they must fit in, horizontally."""
+    if target.half is None or target.centre is None:
+        return 0.0
+    return float((np.abs(points[:, :2] - target.centre) - target.half).max(initial=0.0))
+
+
+def _rest(points: np.ndarray, obstacles: np.ndarray, floor: float, config: Margins) -> float:
+    """Vertical move that brings points to rest on obstacles or on the floor, nearly touching."""
+    lift = floor - points[:, 2].min()
+    low, high = points[:, :2].min(axis=0) - config.support_radius, points[:, :2].max(axis=0) + config.support_radius
+    obstacles = obstacles[((obstacles[:, :2] > low) & (obstacles[:, :2] < high)).all(axis=1)]
+    if len(obstacles):
+        apart = np.linalg.norm(points[:, None, :2] - obstacles[None, :, :2], axis=2)
+        under = np.where(apart < config.support_radius, points[:, None, 2], np.inf).min(axis=0)
+        lift = max(lift, float((obstacles[:, 2] - under).max()))
+    return lift + config.touchdown
+
+
+def _with_room(hand: np.ndarray, axis: np.ndarray, obstacles: np.ndarray, config: Margins) -> float:
+    """The lowest height from ``hand`` upward at which the open hand touches nothing."""
+    heights = hand[2] + np.arange(0.0, 0.16, 0.01)
+    pos = np.stack([np.full_like(heights, hand[0]), np.full_like(heights, hand[1]), heights], axis=1)
+    hands = Grasps(pos, np.tile(axis, (len(heights), 1)), np.zeros(len(heights)), np.zeros(len(heights)))
+    room = clearance(hands, obstacles, config.gripper)
+    return float(heights[int(np.argmax(room > 0.002))]) if (room > 0.002).any() else float(heights[-1])

@@ -1,0 +1,1 @@
+"""SIMPLER's asset files: what is needed, where it lies, how it is downloaded."""

@@ -1,0 +1,1 @@
+"""SIMPLER's robots: kinematics, controllers, servoing."""

@@ -1,0 +1,1 @@
+"""SIMPLER's scenes on SAPIEN, in worker processes."""

@@ -1,0 +1,1 @@
+"""The episode lists that SIMPLER's published numbers were taken on."""

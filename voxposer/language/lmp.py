@@ -1,0 +1,673 @@
+"""The language programs of VoxPoser: queries in words go in, a model's programs run, maps and motions come out.
+
+In: a language model (``voxposer.language.llm``), the functions programs may call (perception, map helpers,
+``execute``), the names of the objects in the scene. Out: ``Lmps``, which has one method for each program, and a trace
+of every program written.
+
+Each language program (LMP) asks the model to answer a query in code, shown examples from its prompt file, and runs the
+answer in ``voxposer.sandbox``:
+
+- the *planner* splits an instruction into calls of ``composer``, one for each subtask;
+- the *composer* answers a subtask by calling the others and then ``execute``, once or several times;
+- *parse_query_obj* finds what words refer to. The program is kept, not its result: each look at the observation runs it
+  again, so it is always the present one;
+- *get_affordance_map*, *get_avoidance_map*, *get_rotation_map*, *get_velocity_map*, *get_gripper_map* write maps over
+  the voxel grid, kept as programs too and run when ``execute`` asks for them.
+
+The semantics are upstream's (huangwl18/VoxPoser, ``src/LMP.py``, ``src/interfaces.py``, ``rlbench_config.yaml``), its
+prompt files included: stop tokens, the context line, query prefix and suffix, ``ret_val``. What upstream leaves open is
+closed: programs are checked and bounded, a query is one line, and each LMP gets only the functions it is for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import functools
+import re
+import textwrap
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, overload
+
+import numpy as np
+
+from voxposer.language.llm import Llm, LlmError, Message, Reply, ReplyError
+from voxposer.sandbox import interpreter as sandbox
+from voxposer.sandbox.guard import Budget, HostFault, Limits, Opaque, Record, RecordList
+from voxposer.sandbox.interpreter import Program, SandboxError
+
+MAPS = ("get_affordance_map", "get_avoidance_map", "get_rotation_map", "get_velocity_map", "get_gripper_map")
+NAMES = ("planner", "composer", "parse_query_obj", *MAPS)
+
+# Subtasks of one instruction, and characters of one query.
+_SUBTASKS, _QUERY_CHARS = 100, 1000
+
+_SYSTEM = "You program a robot arm that works at a table. You write short, careful Python and answer with code only."
+_TASK = """Queries are for `{name}`. Each is answered by a short program in the manner of these examples:
+
+```
+{prompt}
+```
+
+Answer every query I send next with the program for it, and nothing else: no imports, no prose (comments are welcome), \
+and not the query again. Use what the examples use, in the same way. Coordinates: x runs from back to front, y from \
+left to right, z from bottom to top."""
+_READY = "Understood. Send me a query and I answer with its program."
+
+
+class LmpError(HostFault):
+    """A language program that could not be run, or not on.
+
+    Attributes:
+        lmp: which one.
+        query: what it was asked.
+        rule: the rule of the sandbox that was broken; ``reply`` if the model gave no program, ``query`` for a query
+            that cannot be asked, ``result`` for a value of the wrong kind.
+        reason: what happened.
+        line: line of the program, None if there is none.
+    """
+
+    def __init__(self, lmp: str, query: str, rule: str, reason: str, line: int | None = None) -> None:
+        where = "" if line is None else f"line {line}: "
+        super().__init__(f"{lmp}({query!r}): {where}{reason} [rule: {rule}]")
+        self.lmp, self.query, self.rule, self.reason, self.line = lmp, query, rule, reason, line
+
+
+# What programs hold
+
+
+class Observation(Record, Mapping[str, Any]):
+    """What is known of a thing at one moment: fields such as ``position``, ``aabb`` and ``normal``.
+
+    Reading a field gives a copy of an array, list or dictionary. Fields whose names start with an underscore are for
+    the host alone. Observations are compared by identity.
+    """
+
+    def __init__(self, fields: Mapping[str, Any]) -> None:
+        self._fields = dict(fields)
+
+    def fields(self) -> Collection[str]:
+        """The names that programs may read."""
+        return [name for name in self._fields if not name.startswith("_")]
+
+    def __getitem__(self, name: str, /) -> Any:
+        value = self._fields[name]
+        return copy.deepcopy(value) if isinstance(value, (np.ndarray, list, dict)) else value
+
+    def __getattr__(self, name: str) -> Any:
+        fields = self.__dict__.get("_fields", {})
+        if name not in fields:
+            raise AttributeError(f"the observation has no {name!r}; it has {', '.join(sorted(fields))}")
+        return self[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __str__(self) -> str:
+        return str(self._fields.get("name", "observation"))
+
+
+class DynamicObservation(Record):
+    """A thing as it is whenever it is looked at: each read runs the program that finds it again."""
+
+    def __init__(self, now: Callable[[], Observation]) -> None:
+        self._now = now
+
+    def __call__(self) -> Observation:
+        """The thing as it is now."""
+        return self._now()
+
+    def fields(self) -> Collection[str]:
+        """The names that programs may read."""
+        return self._now().fields()
+
+    def __getitem__(self, name: str, /) -> Any:
+        return self._now()[name]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._now(), name)
+
+    def __str__(self) -> str:
+        return str(self._now())
+
+
+class DynamicObservations(RecordList):
+    """Several things as they are whenever they are looked at."""
+
+    def __init__(self, now: Callable[[], Sequence[Observation]]) -> None:
+        self._now = now
+
+    def __call__(self) -> list[Observation]:
+        """The things as they are now."""
+        return list(self._now())
+
+    def __len__(self) -> int:
+        return len(self._now())
+
+    def __iter__(self) -> Iterator[DynamicObservation]:
+        return (self[place] for place in range(len(self)))
+
+    @overload
+    def __getitem__(self, index: int) -> DynamicObservation: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[DynamicObservation]: ...
+    def __getitem__(self, index: int | slice) -> DynamicObservation | list[DynamicObservation]:
+        if isinstance(index, slice):
+            return [self[place] for place in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"{index} is not among {len(self)} observations")
+        return DynamicObservation(lambda: self._now()[index])
+
+
+class LazyMap(Opaque):
+    """A map of the voxel grid, still a program: calling it runs the program on what is there now.
+
+    Attributes:
+        lmp: which LMP wrote it.
+        query: what it was asked.
+    """
+
+    def __init__(self, lmp: str, query: str, now: Callable[[], np.ndarray]) -> None:
+        self.lmp, self.query, self._now = lmp, query, now
+
+    def __call__(self) -> np.ndarray:
+        """The map, float64: ``[N, N, N]``, or ``[N, N, N, 4]`` (quaternions wxyz) for rotations.
+
+        Raises:
+            LmpError: the program breaks a rule, or made something else.
+        """
+        return self._now()
+
+
+# What an LMP is
+
+
+@dataclass(frozen=True, kw_only=True)
+class LmpConfig:
+    """One language program; upstream's keys.
+
+    Attributes:
+        name: the function programs call it by.
+        stop: tokens its answer ends at.
+        max_tokens: length of its answer at most.
+        temperature: of the model.
+        query_prefix: put before a query.
+        query_suffix: put after it.
+        maintain_session: whether earlier queries and answers are shown again, and their variables kept.
+        include_context: whether the model sees, and the program has, the list ``objects``.
+        has_return: whether the program returns a value.
+        return_val_name: the variable that is returned.
+    """
+
+    name: str
+    stop: tuple[str, ...] = ("# Query: ", "objects =")
+    max_tokens: int = 512
+    temperature: float = 0.0
+    query_prefix: str = "# Query: "
+    query_suffix: str = "."
+    maintain_session: bool = False
+    include_context: bool = False
+    has_return: bool = True
+    return_val_name: str = "ret_val"
+
+
+CONFIGS: Mapping[str, LmpConfig] = MappingProxyType(
+    {
+        "planner": LmpConfig(name="planner", stop=("# Query: ", "objects = "), include_context=True, has_return=False),
+        "composer": LmpConfig(name="composer", has_return=False),
+        "parse_query_obj": LmpConfig(name="parse_query_obj", include_context=True),
+        **{name: LmpConfig(name=name) for name in MAPS},
+    }
+)
+
+# Functions that act, and the only LMPs whose programs may call them: maps and references are evaluated whenever
+# someone looks, so nothing may happen when they are.
+_ACTIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "planner": ("composer",),
+        "composer": ("execute", "reset_to_default_pose", "parse_query_obj", *MAPS),
+        "parse_query_obj": (),
+        **dict.fromkeys(MAPS, ("parse_query_obj",)),
+    }
+)
+_RESTRICTED = frozenset(name for names in _ACTIONS.values() for name in names)
+
+
+@dataclass(kw_only=True)
+class Call:
+    """One question to the model, for people to read.
+
+    Attributes:
+        lmp: which language program.
+        query: what it was asked.
+        context: the context line, empty without.
+        model: the model asked.
+        code: its answer without fences; empty if there was none.
+        cached: whether the answer was kept from earlier.
+        prompt_tokens: tokens of the question, as counted when it was asked.
+        completion_tokens: tokens of the answer, likewise.
+        cost_usd: its price, None if unknown.
+        error: what went wrong with the answer or its program, None if nothing did.
+    """
+
+    lmp: str
+    query: str
+    context: str
+    model: str
+    code: str = ""
+    cached: bool = False
+    prompt_tokens: int = 0
+    completion_tokens: int = 0
+    cost_usd: float | None = None
+    error: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Written:
+    """A program that the model wrote for a query."""
+
+    config: LmpConfig
+    query: str
+    program: Program
+    call: Call
+
+
+class Lmps:
+    """The language programs of one robot: its functions, its scene's objects, its trace.
+
+    Attributes:
+        trace: every question to the model so far, in order.
+    """
+
+    def __init__(
+        self,
+        functions: Mapping[str, Callable[..., Any]],
+        llm: Llm,
+        prompts: Mapping[str, str],
+        *,
+        limits: Limits | None = None,
+        configs: Mapping[str, LmpConfig] = CONFIGS,
+    ) -> None:
+        """Language programs over functions; ``build_lmps`` loads the prompts.
+
+        Args:
+            functions: what programs may call, by name; ``execute`` and ``reset_to_default_pose`` are for the composer.
+            llm: the model; several may share one.
+            prompts: text of each LMP's examples.
+            limits: what a program may use.
+            configs: the LMPs.
+        """
+        self.trace: list[Call] = []
+        self._llm, self._prompts, self._configs = llm, dict(prompts), dict(configs)
+        self._limits = limits or Limits()
+        self._functions = dict(functions) | self._own_functions()
+        self._objects: tuple[str, ...] | None = None
+        self._budget: Budget | None = None
+        self._sessions: dict[str, str] = {}
+        self._session_variables: dict[str, dict[str, Any]] = {}
+
+    def _own_functions(self) -> dict[str, Callable[..., Any]]:
+        makers = {name: getattr(self, name) for name in ("parse_query_obj", *MAPS)}
+        return {"composer": self.composer} | makers
+
+    def set_context(self, objects: Sequence[str]) -> None:
+        """Say which objects there are; the planner and ``parse_query_obj`` are told.
+
+        Raises:
+            TypeError: they are not a list of names.
+        """
+        names = tuple(objects)
+        if isinstance(objects, str) or not all(isinstance(name, str) for name in names):
+            raise TypeError(f"objects are a list of names, not {objects!r}")
+        self._objects = names
+
+    def clear_trace(self) -> None:
+        """Forget the trace, and the sessions of LMPs that keep one."""
+        self.trace.clear()
+        self._sessions.clear()
+        self._session_variables.clear()
+
+    # The eight LMPs
+
+    def planner(self, query: str) -> None:
+        """Do what an instruction says: plan it, and run the composer on each subtask.
+
+        Raises:
+            LmpError: a program, this one's or one it called, cannot be run.
+            LlmError: the model does not answer.
+        """
+        self._execute(self._write("planner", query), self._functions)
+
+    def composer(self, query: str) -> None:
+        """Do one subtask: run the program that calls ``execute``. Raises as ``planner``."""
+        self._execute(self._write("composer", query), self._functions)
+
+    def parse_query_obj(self, query: str) -> DynamicObservation | DynamicObservations:
+        """What words refer to: one thing, or several where the program returns a list.
+
+        Raises:
+            LmpError: the program cannot be run, or found nothing.
+        """
+        written = self._write("parse_query_obj", query)
+        if isinstance(self._things(written), list):
+            return DynamicObservations(lambda: self._several(written))
+        return DynamicObservation(lambda: self._one(written))
+
+    def get_affordance_map(self, query: str) -> LazyMap:
+        """Where to go: 1 at targets, 0 elsewhere."""
+        return self._map("get_affordance_map", query)
+
+    def get_avoidance_map(self, query: str) -> LazyMap:
+        """Where not to go: 0 to 1."""
+        return self._map("get_avoidance_map", query)
+
+    def get_rotation_map(self, query: str) -> LazyMap:
+        """How the hand is turned at each place: quaternions wxyz, world frame."""
+        return self._map("get_rotation_map", query)
+
+    def get_velocity_map(self, query: str) -> LazyMap:
+        """How fast the hand moves at each place: 1 is normal."""
+        return self._map("get_velocity_map", query)
+
+    def get_gripper_map(self, query: str) -> LazyMap:
+        """Whether the gripper is open at each place: 1 open, 0 closed."""
+        return self._map("get_gripper_map", query)
+
+    def plan(self, query: str) -> tuple[str, ...]:
+        """The subtasks an instruction is split into, in order; nothing is done. Raises as ``planner``."""
+        subtasks: list[str] = []
+        written = self._write("planner", query)
+        self._execute(written, self._functions | {"composer": _recorder(subtasks)})
+        return tuple(subtasks)
+
+    # Results
+
+    def _map(self, name: str, query: str) -> LazyMap:
+        written = self._write(name, query)
+        return LazyMap(name, written.query, lambda: self._voxels(written))
+
+    def _voxels(self, written: _Written) -> np.ndarray:
+        """The map a program makes, checked to be one."""
+        value = self._execute(written, self._functions)
+        tail = (4,) if written.config.name == "get_rotation_map" else ()
+        shape = np.shape(value) if isinstance(value, np.ndarray) else (0,)
+        if shape != (shape[0],) * 3 + tail:
+            wanted = "[N, N, N, 4]" if tail else "[N, N, N]"
+            raise self._wrong(written, f"the program returned {_shown(value)}, not a map {wanted}")
+        if not np.isfinite(value).all():
+            raise self._wrong(written, "the map has values that are not finite")
+        return np.asarray(value, np.float64)
+
+    def _things(self, written: _Written) -> Observation | list[Observation]:
+        value = self._execute(written, self._functions)
+        single = not isinstance(value, (list, tuple, RecordList))
+        things = [_static(item) for item in ([value] if single else value)]
+        if not things or any(thing is None for thing in things):
+            raise self._wrong(written, f"the program found {_shown(value)}, not an observation")
+        found = [thing for thing in things if thing is not None]
+        return found[0] if single else found
+
+    def _one(self, written: _Written) -> Observation:
+        things = self._things(written)
+        return things[0] if isinstance(things, list) else things
+
+    def _several(self, written: _Written) -> list[Observation]:
+        things = self._things(written)
+        return things if isinstance(things, list) else [things]
+
+    def _wrong(self, written: _Written, reason: str) -> LmpError:
+        written.call.error = reason
+        return LmpError(written.config.name, written.query, "result", reason)
+
+    # Writing programs
+
+    def _write(self, name: str, query: Any) -> _Written:
+        """The program for a query, asked of the model."""
+        config, words = self._configs[name], self._words(name, query)
+        context = self._context(config, words)
+        call = Call(lmp=name, query=words, context=context, model=self._llm.config.model)
+        if self._budget is not None:
+            self._budget.program()
+        self.trace.append(call)
+        with self._inside(call), self._clock_stopped():
+            reply = self._asked(config, call)
+            call.cached, call.cost_usd = reply.cached, reply.cost_usd
+            call.prompt_tokens, call.completion_tokens = reply.prompt_tokens, reply.completion_tokens
+            return _Written(config=config, query=words, program=self._parsed(call, reply.text), call=call)
+
+    def _words(self, name: str, query: Any) -> str:
+        """A query as one line without the suffix."""
+        if not isinstance(query, str):
+            raise LmpError(name, str(query)[:80], "query", f"a query is text, not {type(query).__name__}")
+        words = " ".join(query.split()).rstrip(". ")
+        if not words or len(words) > _QUERY_CHARS:
+            raise LmpError(name, words[:80], "query", f"a query has 1 to {_QUERY_CHARS} characters, not {len(words)}")
+        return words
+
+    def _context(self, config: LmpConfig, query: str) -> str:
+        if not config.include_context:
+            return ""
+        if self._objects is None:
+            raise LmpError(config.name, query, "query", "no objects are known; call set_context first")
+        return f"objects = {list(self._objects)}"
+
+    def _asked(self, config: LmpConfig, call: Call) -> Reply:
+        try:
+            return self._llm.complete(
+                self._messages(config, call),
+                stop=config.stop,
+                max_tokens=config.max_tokens,
+                temperature=config.temperature,
+                check=lambda text: self._parsed(call, text),
+            )
+        except ReplyError as error:
+            raise LmpError(call.lmp, call.query, "reply", str(error)) from error
+        except LlmError as error:
+            error.add_note(f"asked by {call.lmp}({call.query!r})")
+            raise
+
+    def _messages(self, config: LmpConfig, call: Call) -> list[Message]:
+        """The request: examples first, then the query with its context."""
+        session = self._sessions.get(config.name, "")
+        prompt = self._prompt(config) + (f"\n\n{session}" if session else "")
+        return [
+            {"role": "system", "content": _SYSTEM},
+            {"role": "user", "content": _TASK.format(name=config.name, prompt=prompt)},
+            {"role": "assistant", "content": _READY},
+            {"role": "user", "content": _lines(call.context, _query_line(config, call.query))},
+        ]
+
+    def _prompt(self, config: LmpConfig) -> str:
+        """The examples, with upstream's placeholder for the line that imports the functions."""
+        names = sorted(self._allowed(config.name, self._functions))
+        return self._prompts[config.name].replace("{variable_vars_imports}", f"from utils import {', '.join(names)}")
+
+    def _parsed(self, call: Call, text: str) -> Program:
+        call.code = code_in(text)
+        try:
+            return _parse(call.code, self._limits)
+        except SandboxError as error:
+            reason = f"{call.model} wrote what cannot be run: {error.reason}, in {_start(call.code)}"
+            raise LmpError(call.lmp, call.query, error.rule, reason, error.line) from error
+
+    # Running programs
+
+    def _execute(self, written: _Written, functions: Mapping[str, Callable[..., Any]]) -> Any:
+        """Run a program; what goes wrong in it is told as this LMP's."""
+        config = written.config
+        variables = dict(self._session_variables.get(config.name, {}))
+        if config.include_context:
+            variables["objects"] = list(self._objects or ())
+        with self._inside(written.call), self._running(written) as budget:
+            outcome = written.program.run(
+                self._allowed(config.name, functions),
+                variables,
+                returns=config.return_val_name if config.has_return else None,
+                budget=budget,
+            )
+        if config.maintain_session:
+            self._remember(written, outcome.variables)
+        return outcome.value
+
+    def _allowed(self, name: str, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
+        """The functions that an LMP's programs may call."""
+        return {key: value for key, value in functions.items() if key not in _RESTRICTED or key in _ACTIONS[name]}
+
+    @contextlib.contextmanager
+    def _running(self, written: _Written) -> Iterator[Budget]:
+        """The budget a program draws on: that of the program it runs for; a composer's always has its own."""
+        outer = self._budget
+        if outer is None or written.config.name == "composer":
+            self._budget = Budget(self._limits)
+        try:
+            assert self._budget is not None
+            yield self._budget
+        except SandboxError as error:
+            raise LmpError(
+                written.config.name, written.query, error.rule, error.reason, error.line
+            ) from error.__cause__
+        except HostFault as error:
+            error.add_note(f"in {written.config.name}({written.query!r})")
+            raise
+        finally:
+            self._budget = outer
+
+    @contextlib.contextmanager
+    def _clock_stopped(self) -> Iterator[None]:
+        """The model's time is not the program's."""
+        with self._budget.clock(running=False) if self._budget else contextlib.nullcontext():
+            yield
+
+    @contextlib.contextmanager
+    def _inside(self, call: Call) -> Iterator[None]:
+        """Write what goes wrong into the trace."""
+        try:
+            yield
+        except Exception as error:
+            call.error = str(error)
+            raise
+
+    def _remember(self, written: _Written, variables: Mapping[str, Any]) -> None:
+        config = written.config
+        said = _lines(written.call.context, _query_line(config, written.query), written.call.code)
+        self._sessions[config.name] = _lines(self._sessions.get(config.name, ""), said)
+        self._session_variables[config.name] = dict(variables)
+
+
+def build_lmps(
+    functions: Mapping[str, Callable[..., Any]],
+    llm: Llm,
+    prompts_dir: str | Path | None = None,
+    limits: Limits | None = None,
+    configs: Mapping[str, LmpConfig] = CONFIGS,
+) -> Lmps:
+    """The language programs with their prompts loaded.
+
+    Args:
+        functions: as for ``Lmps``.
+        llm: the model.
+        prompts_dir: a folder with ``{lmp}.txt`` or, as upstream names them, ``{lmp}_prompt.txt``; the package's own
+            prompts by default.
+        limits: what a program may use.
+        configs: the LMPs.
+
+    Raises:
+        FileNotFoundError: a prompt is missing.
+    """
+    return Lmps(functions, llm, load_prompts(prompts_dir), limits=limits, configs=configs)
+
+
+def load_prompts(prompts_dir: str | Path | None = None) -> dict[str, str]:
+    """The examples of each LMP, from the package or a folder.
+
+    Raises:
+        FileNotFoundError: a prompt is missing.
+    """
+    where = resources.files("voxposer") / "prompts" if prompts_dir is None else Path(prompts_dir)
+    return {name: _prompt_file(where, name).read_text(encoding="utf-8").strip() for name in NAMES}
+
+
+def _prompt_file(where: Traversable, name: str) -> Traversable:
+    files = [where / f"{name}.txt", where / f"{name}_prompt.txt"]
+    found = next((file for file in files if file.is_file()), None)
+    if found is None:
+        raise FileNotFoundError(f"no prompt for {name}: neither {name}.txt nor {name}_prompt.txt is in {where}")
+    return found
+
+
+def run_planner(lmps: Lmps, instruction: str) -> tuple[str, ...]:
+    """The subtasks that the planner splits an instruction into, in order; nothing is done.
+
+    Raises:
+        LmpError: the planner's program cannot be run.
+        LlmError: the model does not answer.
+    """
+    return lmps.plan(instruction)
+
+
+def code_in(text: str) -> str:
+    """The code in a model's answer: what stands in fences, if there are any, without common indentation."""
+    fenced = re.findall(r"^[ \t]*```[^\n]*\n(.*?)(?:^[ \t]*```|\Z)", text, re.DOTALL | re.MULTILINE)
+    code = "\n".join(block.strip("\n") for block in fenced) if fenced else text.replace("```", "")
+    return textwrap.dedent(code.replace("\r\n", "\n").expandtabs(4).strip("\n")).rstrip()
+
+
+@functools.lru_cache(maxsize=4096)
+def _parse(code: str, limits: Limits) -> Program:
+    """A program; batches of episodes are answered with the same few over and over."""
+    return sandbox.parse(code, limits=limits)
+
+
+def _query_line(config: LmpConfig, query: str) -> str:
+    return f"{config.query_prefix}{query}{config.query_suffix}"
+
+
+def _lines(*parts: str) -> str:
+    return "\n".join(part for part in parts if part)
+
+
+def _recorder(subtasks: list[str]) -> Callable[[Any], None]:
+    """A composer that only writes down what it is asked."""
+
+    def composer(query: Any) -> None:
+        if not isinstance(query, str):
+            raise TypeError(f"a subtask is text, not {type(query).__name__}")
+        if len(subtasks) == _SUBTASKS:
+            raise ValueError(f"more than {_SUBTASKS} subtasks")
+        subtasks.append(query)
+
+    return composer
+
+
+def _static(value: Any) -> Observation | None:
+    """An observation as it is now; None for what is none."""
+    if isinstance(value, DynamicObservation):
+        return value()
+    return value if isinstance(value, Observation) else None
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"an array {list(value.shape)}"
+    return "nothing" if value is None else f"{type(value).__name__} {str(value)[:80]!r}"
+
+
+def _start(code: str) -> str:
+    line = code.strip().splitlines()[0] if code.strip() else ""
+    return repr(line if len(line) <= 80 else f"{line[:77]}...")

@@ -1,0 +1,1 @@
+"""A rule-based writer of programs: no network, no model."""

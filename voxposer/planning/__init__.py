@@ -1,0 +1,1 @@
+"""Value maps, and the paths and pushes planned on them."""

@@ -1,0 +1,453 @@
+"""The path planner: greedy descent through a cost volume, smoothed, cut, spaced out and ended on a target.
+
+In, for each slot: the voxel to start from, a target map, an obstacle map, and whether an object is to be moved rather
+than the hand. Out: ``Paths``, voxel units, padded tensors with their lengths. It is the planner of VoxPoser
+(huangwl18/VoxPoser @ e3a4c9e, ``planners.py``), one slot as exact as the other: the raw path visits the same voxels as
+NumPy and SciPy's would, which takes float64, SciPy's order of summation and NumPy's first of several minima.
+
+``optimize_paths`` is one jitted function for any device, and may be traced into a larger one, if that is compiled with
+float64 enabled (JAX cannot lower float64 within a float32 function). Called with concrete arrays on a CPU it does the
+descent in ``planner_numba``, which finds the same voxels several times quicker.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+
+from voxposer.planning import maps
+
+# A bend sharper than ``max_curvature`` counts from this waypoint on, and the path ends at this share of the way to it.
+_FIRST_BEND = 5
+_KEPT_OF_BEND = 0.9
+# From this size on a step of 2 % of the side is a voxel or more.
+_SMALLEST_GRID = 50
+# Slots whose maps are in memory at once, outside a CPU.
+_SLOTS_AT_ONCE = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerConfig:
+    """Numbers of the planner, by upstream's names; lengths are in hundredths of the grid's side.
+
+    Attributes:
+        stop_threshold: the descent ends where no neighbour costs less than this much more than the voxel it is at.
+        savgol_polyorder: degree of the polynomials that smooth the path.
+        savgol_window_size: waypoints such a polynomial is fitted to; shorter paths take what they have.
+        obstacle_map_weight: weight of the blurred obstacle map, itself scaled to [0, 1].
+        max_steps: steps of the descent at most.
+        obstacle_map_gaussian_sigma: standard deviation of the blur, in voxels.
+        target_map_weight: weight of the distance to the nearest target, itself scaled to [0, 1].
+        stop_criteria: the only one there is.
+        target_spacing: inner waypoints that lie closer are thinned out.
+        max_curvature: the path is cut before the first sharper bend, 1/voxel.
+        pushing_skip_per_k: where an object is moved, every how many waypoints are kept.
+
+    Raises:
+        ValueError: naming the field that is out of range.
+    """
+
+    stop_threshold: float = 0.001
+    savgol_polyorder: int = 3
+    savgol_window_size: int = 20
+    obstacle_map_weight: float = 1
+    max_steps: int = 300
+    obstacle_map_gaussian_sigma: float = 10
+    target_map_weight: float = 2
+    stop_criteria: Literal["no_nearby_equal"] = "no_nearby_equal"
+    target_spacing: float = 1
+    max_curvature: float = 3
+    pushing_skip_per_k: int = 5
+
+    def __post_init__(self) -> None:
+        if self.stop_criteria != "no_nearby_equal":
+            raise ValueError(f"stop_criteria must be 'no_nearby_equal', got {self.stop_criteria!r}")
+        for name in ("savgol_window_size", "max_steps", "pushing_skip_per_k"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("savgol_polyorder", "obstacle_map_gaussian_sigma", "target_spacing"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
+
+class Fault(enum.IntEnum):
+    """Why a slot has no path."""
+
+    NONE = 0
+    NO_TARGET = 1
+    """No voxel of the target map equals 1."""
+    NOT_FINITE = 2
+    """NaN or infinity in a map or in the start."""
+
+
+class Paths(NamedTuple):
+    """What ``optimize_paths`` returns, voxel units; behind its length a path repeats its last entry.
+
+    Attributes:
+        raw: voxels of the descent, the start first, int32 [B, max_steps + 1, 3].
+        raw_length: how many there are, int32 [B]; 0 for a slot with a fault.
+        path: waypoints, float32 [B, max_steps + 2, 3], within the grid.
+        path_length: how many there are, int32 [B]; 0 for a slot with a fault.
+        fault: ``Fault`` of each slot, int32 [B].
+    """
+
+    raw: jax.Array
+    raw_length: jax.Array
+    path: jax.Array
+    path_length: jax.Array
+    fault: jax.Array
+
+
+def optimize_paths(
+    start: Any,
+    target: Any,
+    obstacle: Any,
+    object_centric: Any,
+    config: PlannerConfig = PlannerConfig(),
+    *,
+    engine: Literal["auto", "jax", "numba"] = "auto",
+) -> Paths:
+    """A path for every slot.
+
+    Args:
+        start: voxel to start from, [B, 3]; rounded and moved into the grid if need be.
+        target: [B, N, N, N] with N >= 50; targets are the voxels equal to 1.
+        obstacle: [B, N, N, N], what to keep away from (``maps.preprocess_avoidance``). Give float64 where the values
+            are not exact in float32: the last bits decide between equally good ways.
+        object_centric: bool [B], an object is pushed: the path keeps the start's height, and skips waypoints.
+        config: the planner's numbers.
+        engine: ``"jax"``: one jitted function, on the device of its arguments. ``"numba"``: the descent as compiled
+            loops on the CPU's cores. ``"auto"``: numba for concrete arrays if JAX runs on a CPU, otherwise JAX.
+
+    Returns:
+        The paths. A slot without a target or with a map that is not finite has length 0 and says so in ``fault``; the
+        others are not affected.
+
+    Raises:
+        ValueError: shapes that don't fit together, a grid too small to have neighbours, or tracing without float64.
+    """
+    arrays = _checked(start, target, obstacle, object_centric)
+    traced = any(isinstance(array, Tracer) for array in arrays)
+    if engine == "numba" and traced:
+        raise ValueError("the numba engine needs concrete arrays, not traced ones")
+    if traced and jnp.zeros(0).dtype != jnp.float64:
+        raise ValueError("optimize_paths is float64: trace functions that call it within jax.enable_x64(True)")
+    # Only what happens in here is float64; the caller's own precision stays what it was.
+    with jax.enable_x64(True):
+        if engine == "numba" or (engine == "auto" and not traced and _on_cpu(arrays)):
+            return _with_numba(*arrays, config)
+        return _with_jax(*arrays, config)
+
+
+def _checked(start: Any, target: Any, obstacle: Any, object_centric: Any) -> tuple[Any, Any, Any, Any]:
+    arrays = tuple(x if isinstance(x, jax.Array) else np.asarray(x) for x in (start, target, obstacle, object_centric))
+    slots, size = arrays[0].shape[:1], arrays[1].shape[-1:]
+    wanted = {"start": (*slots, 3), "target": (*slots, *size * 3), "obstacle": (*slots, *size * 3)}
+    for (name, shape), array in zip((wanted | {"object_centric": slots}).items(), arrays, strict=True):
+        if array.shape != shape or not slots:
+            raise ValueError(f"{name} must have shape {list(shape)}, got {list(array.shape)}")
+    if size[0] < _SMALLEST_GRID:
+        raise ValueError(f"a grid of {size[0]} voxels a side has no neighbours within 2 %: {_SMALLEST_GRID} or more")
+    return cast(tuple[Any, Any, Any, Any], arrays)
+
+
+def _on_cpu(arrays: tuple[Any, ...]) -> bool:
+    placed = [device.platform for array in arrays if isinstance(array, jax.Array) for device in array.devices()]
+    return all(platform == "cpu" for platform in placed or [jax.default_backend()])
+
+
+def reach(size: int) -> int:
+    """How many voxels a step may go along each axis."""
+    return int(2 * size / 100)
+
+
+def neighbour_offsets(size: int) -> np.ndarray:
+    """Offsets of a voxel's surroundings, itself included, in the order of ``np.unique``, [K, 3]."""
+    steps = np.arange(-reach(size), reach(size) + 1)
+    return np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The two ways to the raw path.
+
+
+def _with_numba(start: Any, target: Any, obstacle: Any, planar: Any, config: PlannerConfig) -> Paths:
+    from voxposer.planning import planner_numba
+
+    target, obstacle, planar = np.asarray(target), np.asarray(obstacle), np.asarray(planar, bool)
+    raw, length, fault = planner_numba.descend(np.asarray(start), target, obstacle, planar, config)
+    path, path_length = _shape(raw, length, config, target.shape[-1])
+    end, snap = planner_numba.ends(target, np.asarray(_last(path, path_length)))
+    return _finish(raw, length, fault, path, path_length, end, snap, planar, config, target.shape[-1])
+
+
+@partial(jax.jit, static_argnames="config")
+def _with_jax(start: Any, target: Any, obstacle: Any, planar: Any, config: PlannerConfig) -> Paths:
+    plan = partial(_plan, config=config)
+    arrays = start, target, obstacle, planar.astype(bool)
+    return lax.platform_dependent(*arrays, cpu=partial(_in_parts, plan, 1), default=partial(_in_parts, plan, None))
+
+
+def _in_parts(plan: Any, at_once: int | None, *arrays: jax.Array) -> Paths:
+    """Apply ``plan`` to some slots after the other, which bounds the memory."""
+    slots = len(arrays[0])
+    if not slots:
+        return jax.tree.map(lambda x: x[:0], plan(*(jnp.zeros((1, *array.shape[1:]), array.dtype) for array in arrays)))
+    at_once = min(at_once or _SLOTS_AT_ONCE, slots)
+    whole = slots // at_once * at_once
+    parts = []
+    if whole:
+        stacked = [array[:whole].reshape(-1, at_once, *array.shape[1:]) for array in arrays]
+        done = lax.map(lambda part: plan(*part), stacked)
+        parts.append(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), done))
+    if whole < slots:
+        parts.append(plan(*(array[whole:] for array in arrays)))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+def _plan(start: jax.Array, target: jax.Array, obstacle: jax.Array, planar: jax.Array, config: PlannerConfig) -> Paths:
+    size = target.shape[-1]
+    obstacle = obstacle.astype(jnp.float64)
+    fault = _faults(start, target, obstacle)
+    voxel = jnp.clip(jnp.round(jnp.nan_to_num(start)), 0, size - 1).astype(jnp.int32)
+    raw, length = _descend(voxel, cost_map(target == 1, obstacle, config), planar, config)
+    path, path_length = _shape(raw, length, config, size)
+    end, snap = _ends(target, _last(path, path_length))
+    return _finish(raw, length, fault, path, path_length, end, snap, planar, config, size)
+
+
+def _faults(start: jax.Array, target: jax.Array, obstacle: jax.Array) -> jax.Array:
+    volume = (-3, -2, -1)
+    finite = jnp.isfinite(start).all(-1) & jnp.isfinite(target).all(volume) & jnp.isfinite(obstacle).all(volume)
+    lost = ~(target == 1).any(volume)
+    return jnp.where(finite, jnp.where(lost, Fault.NO_TARGET, Fault.NONE), Fault.NOT_FINITE).astype(jnp.int32)
+
+
+def cost_map(target: jax.Array, obstacle: jax.Array, config: PlannerConfig) -> jax.Array:
+    """What a voxel costs: far from ``target`` (bool) and near to ``obstacle``, [..., N, N, N] in [0, 1]."""
+    far = maps.normalize(jnp.sqrt(maps.squared_distance(target).astype(obstacle.dtype)))
+    near = maps.normalize(maps.gaussian_blur(obstacle, config.obstacle_map_gaussian_sigma))
+    zero = maps.opaque_zero(obstacle)
+    weighted = (far, config.target_map_weight), (near, config.obstacle_map_weight)
+    far, near = (maps.rounded(volume * weight, zero) for volume, weight in weighted)
+    return maps.normalize(far + near)
+
+
+class _Descent(NamedTuple):
+    """Where a descent is: steps taken, voxel [G, 3], still moving [G], costs around [G, K], and what it wrote."""
+
+    step: jax.Array
+    here: jax.Array
+    active: jax.Array
+    around: jax.Array
+    cost: jax.Array
+    raw: jax.Array
+    length: jax.Array
+
+
+def _descend(
+    start: jax.Array, cost: jax.Array, planar: jax.Array, config: PlannerConfig
+) -> tuple[jax.Array, jax.Array]:
+    """Raw paths int32 [G, max_steps + 1, 3] and their lengths [G], all slots in step.
+
+    A batched loop written out: under ``vmap`` every step would copy the volumes to select the slots still moving.
+    """
+    size, margin = cost.shape[-1], reach(cost.shape[-1])
+    offsets = jnp.asarray(neighbour_offsets(size), jnp.int32)
+    middle, slots = len(offsets) // 2, jnp.arange(len(start))
+    level = jnp.asarray(offsets[:, 2] == 0)
+    # Beyond the border everything costs infinitely much, which is as good as not being there.
+    padded = jnp.pad(cost, [(0, 0), *[(margin, margin)] * 3], constant_values=jnp.inf)
+
+    def surroundings(cost: jax.Array, here: jax.Array) -> jax.Array:
+        block = (2 * margin + 1,) * 3
+        return jax.vmap(lambda c, at: lax.dynamic_slice(c, at, block))(cost, here).reshape(len(slots), -1)
+
+    def candidates(around: jax.Array, here: jax.Array, flat: jax.Array) -> jax.Array:
+        # Upstream takes out the voxel itself before clipping to the grid, and clipping at a border brings it back.
+        edge = (here == 0) | (here == size - 1)
+        own = edge[:, :2].any(-1) | (edge[:, 2] & ~flat)
+        allowed = (level | ~flat[:, None]) & ((jnp.arange(len(offsets)) != middle) | own[:, None])
+        return jnp.where(allowed, around, jnp.inf)
+
+    def step(d: _Descent) -> _Descent:
+        choice = jnp.argmin(candidates(d.around, d.here, planar), axis=-1)
+        there = jnp.where(d.active[:, None], d.here + offsets[choice], d.here)
+        x, y, z = (d.here + margin).T
+        cost = d.cost.at[slots, x, y, z].add(d.active.astype(d.cost.dtype), unique_indices=True)
+        around = surroundings(cost, there)
+        worth = candidates(around, there, jnp.zeros_like(planar)) < around[:, middle, None] + config.stop_threshold
+        raw = lax.dynamic_update_index_in_dim(d.raw, there, d.step + 1, 1)
+        length = jnp.where(d.active, d.step + 2, d.length)
+        return _Descent(d.step + 1, there, d.active & worth.any(-1), around, cost, raw, length)
+
+    raw = jnp.broadcast_to(start[:, None], (len(start), config.max_steps + 1, 3))
+    first = _Descent(
+        step=jnp.zeros((), jnp.int32),
+        here=start,
+        active=jnp.ones(len(start), bool),
+        around=surroundings(padded, start),
+        cost=padded,
+        raw=raw,
+        length=jnp.ones(len(start), jnp.int32),
+    )
+    end = lax.while_loop(lambda d: (d.step < config.max_steps) & d.active.any(), step, first)
+    behind = jnp.arange(raw.shape[1]) >= end.length[:, None]
+    return jnp.where(behind[..., None], end.here[:, None], end.raw), end.length
+
+
+def _ends(target: jax.Array, last: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The target voxel nearest to ``last`` [G, 3], the first of several, and whether the path has to be led there."""
+    size = target.shape[-1]
+    voxel = jnp.clip(jnp.round(last), 0, size - 1).astype(jnp.int32)
+    x, y, z = ((jnp.arange(size) - voxel[:, i, None]).astype(jnp.int64) ** 2 for i in range(3))
+    squares = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :]
+    # Distance first, then place in the grid, in one number: its minimum is the first of the nearest.
+    place = jnp.arange(size**3).reshape(1, size, size, size)
+    key = jnp.where(target == 1, squares * size**3 + place, jnp.iinfo(jnp.int64).max).min((1, 2, 3))
+    end = jnp.stack(jnp.unravel_index(key % size**3, (size, size, size)), axis=-1)
+    on_target = target[jnp.arange(len(voxel)), voxel[:, 0], voxel[:, 1], voxel[:, 2]] != 0
+    return end, ~on_target
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# From the raw path to waypoints; all of it on [B, L, 3] arrays, a slot at a time under vmap.
+
+
+@partial(jax.jit, static_argnames=("config", "size"))
+def _shape(raw: jax.Array, length: jax.Array, config: PlannerConfig, size: int) -> tuple[jax.Array, jax.Array]:
+    """Smoothed, cut and spaced-out paths float64 [B, L, 3], and their lengths [B]."""
+
+    def one(raw: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:
+        path = smooth(raw.astype(jnp.float64), length, config.savgol_window_size, config.savgol_polyorder)
+        length = _cut(path, length, config.max_curvature)
+        return _space_out(path, length, int(config.target_spacing * size / 100))
+
+    return jax.vmap(one)(raw, length)
+
+
+@partial(jax.jit, static_argnames=("config", "size"))
+def _finish(
+    raw: jax.Array,
+    raw_length: jax.Array,
+    fault: jax.Array,
+    path: jax.Array,
+    length: jax.Array,
+    end: jax.Array,
+    snap: jax.Array,
+    planar: jax.Array,
+    config: PlannerConfig,
+    size: int,
+) -> Paths:
+    """Lead each path to its ``end`` [B, 3] where ``snap`` [B] says so, thin out those of objects, and pack up."""
+
+    def one(path: jax.Array, length: jax.Array, last: jax.Array, end: jax.Array, snap: jax.Array, planar: Any) -> Any:
+        height = jnp.where(planar, jnp.clip(jnp.round(last[2]), 0, size - 1), end[2])
+        path = jnp.concatenate([path, path[-1:]])
+        behind = (jnp.arange(len(path)) >= length)[:, None]
+        path = jnp.where(snap & behind, end.at[2].set(height), path)
+        length = length + snap
+        thinned, count = _every(path, length, config.pushing_skip_per_k)
+        return jnp.where(planar, thinned, path), jnp.where(planar, count, length)
+
+    path, length = jax.vmap(one)(path, length, _last(path, length), end.astype(path.dtype), snap, planar)
+    sound = fault == Fault.NONE
+    path = jnp.where(sound[:, None, None], jnp.clip(path, 0, size - 1), raw[:, :1])
+    raw = jnp.where(sound[:, None, None], raw, raw[:, :1])
+    raw_length, length = (jnp.where(sound, x, 0).astype(jnp.int32) for x in (raw_length, length))
+    return Paths(raw, raw_length, path.astype(jnp.float32), length, fault)
+
+
+def smooth(path: jax.Array, length: jax.Array, window: int, degree: int) -> jax.Array:
+    """SciPy's ``savgol_filter(path[:length], min(length, window), min(degree, ...))``, its ``"interp"`` ends included.
+
+    With an even window the inner waypoints are estimates half a sample further on, as SciPy's are.
+
+    Args:
+        path: [L, 3], of which ``length`` count.
+        length: at least 1.
+        window: samples a polynomial is fitted to; fewer if the path is shorter.
+        degree: of the polynomial; lower if the samples don't determine it.
+
+    Returns:
+        [L, 3]; behind ``length`` it repeats the last entry.
+    """
+    fitted, inner = (jnp.asarray(table, path.dtype) for table in _savgol_tables(window, degree))
+    width = jnp.minimum(length, window)
+    half, i = width // 2, jnp.minimum(jnp.arange(len(path)), length - 1)
+    head, tail = i < half, i >= length - half
+    begin = jnp.where(head, 0, jnp.where(tail, length - width, i - (width - 1) // 2))
+    rows = jnp.where((head | tail)[:, None], fitted[width, jnp.clip(i - begin, 0, window - 1)], inner[width])
+    samples = path[jnp.minimum(begin[:, None] + jnp.arange(window), len(path) - 1)]
+    return (rows[..., None] * samples).sum(axis=1)
+
+
+def _savgol_tables(window: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """For each width: weights that evaluate the fit at every sample [w, i, :], and in the middle [w, :]."""
+    fitted, inner = np.zeros((window + 1, window, window)), np.zeros((window + 1, window))
+    for width in range(1, window + 1):
+        # Centred and scaled, so that the powers are well conditioned.
+        at = (np.arange(width) - (width - 1) / 2) / max(width - 1, 1)
+        powers = at[:, None] ** np.arange(min(degree, width - 1) + 1)
+        solve = np.linalg.pinv(powers)
+        fitted[width, :width, :width] = powers @ solve
+        inner[width, :width] = solve[0]
+    return fitted, inner
+
+
+def _gradient(path: jax.Array, length: jax.Array) -> jax.Array:
+    """``np.gradient`` of the first ``length`` entries along axis 0."""
+    i = jnp.arange(len(path))
+    before, after = jnp.maximum(i - 1, 0), jnp.minimum(i + 1, length - 1)
+    return (path[after] - path[before]) / jnp.maximum(after - before, 1)[:, None]
+
+
+def _cut(path: jax.Array, length: jax.Array, sharpest: float) -> jax.Array:
+    """Length of a path [L, 3] that ends shortly before its first bend sharper than ``sharpest``."""
+    velocity = _gradient(path, length)
+    turn = jnp.cross(velocity, _gradient(velocity, length))
+    curvature = jnp.sqrt((turn**2).sum(-1)) / ((velocity**2).sum(-1)) ** 1.5
+    i = jnp.arange(len(path))
+    # A NaN, where the path stands still, is not a bend: comparisons with it are False.
+    sharp = (curvature > sharpest) & (i >= _FIRST_BEND) & (i < length)
+    kept = jnp.asarray([int(_KEPT_OF_BEND * k) for k in range(len(path))], length.dtype)
+    return jnp.where(sharp.any(), kept[jnp.argmax(sharp)], length)
+
+
+def _space_out(path: jax.Array, length: jax.Array, spacing: int) -> tuple[jax.Array, jax.Array]:
+    """Of the inner waypoints keep every k-th, so that they lie about ``spacing`` apart, and both ends."""
+    inner = length - 2
+    gap = jnp.sqrt(((path[1:] - path[:-1]) ** 2).sum(-1))
+    k = jnp.arange(len(gap))
+    total = jnp.where((k >= 1) & (k < inner), gap, 0).sum()
+    mean = total / jnp.maximum(inner - 1, 1)
+    ratio = jnp.round(spacing / jnp.where(total > 0, mean, 1))
+    skip = jnp.where((inner > 1) & (total > spacing), jnp.maximum(ratio, 1), 1).astype(length.dtype)
+    count = jnp.maximum(-(-inner // skip), 0)
+    i = jnp.arange(len(path))
+    source = jnp.where(i == 0, 0, jnp.where(i <= count, 1 + (i - 1) * skip, length - 1))
+    return path[source], count + 2
+
+
+def _every(path: jax.Array, length: jax.Array, k: int) -> tuple[jax.Array, jax.Array]:
+    """``path[k:-1:k]`` and the last waypoint, which is repeated behind."""
+    count = jnp.maximum(length - 2, 0) // k
+    i = jnp.arange(len(path))
+    return path[jnp.where(i < count, jnp.minimum((i + 1) * k, length - 1), length - 1)], count + 1
+
+
+def _last(path: jax.Array, length: jax.Array) -> jax.Array:
+    """Where each path ends, [B, 3], the nearest billionth of a voxel.
+
+    The window is a few samples of whole numbers, so a smoothed path does end half-way between voxels, give or take the
+    rounding of whatever fitted the polynomial. Upstream leaves the choice to that rounding.
+    """
+    return jnp.round(path[jnp.arange(len(path)), length - 1], 9)
