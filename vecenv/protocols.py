@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from vecenv.contract import FINAL, FIRST
+from vecenv.errors import InvalidInput
 
 # What NumPy's legacy generator takes as a seed.
 MAX_SEED = 2**32 - 1
@@ -23,7 +24,7 @@ LIBERO, SIMPLER = "libero", "simpler"
 _TASKS = {"libero_90": 90}
 
 
-class ProtocolError(ValueError):
+class ProtocolError(InvalidInput):
     """A protocol, or a value in one, that does not exist; the message names what does."""
 
 

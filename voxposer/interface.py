@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.manipulation.world import matrix
 from voxposer.perception import EE_ALIASES, Detected, Perception, quaternion
 
@@ -22,7 +23,7 @@ from voxposer.perception import EE_ALIASES, Detected, Perception, quaternion
 _GRIP_REACH = 3.0
 
 
-class InterfaceError(ValueError):
+class InterfaceError(InvalidInput):
     """A program called a function with something that makes no sense; the message says what would."""
 
 

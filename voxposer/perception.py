@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from vecenv.contract import ObjectsSnapshot, Part, PointCloud, RegionBox
+from vecenv.errors import NotFound
 from vecenv.manipulation.grasps import Grasps, Gripper, clearance, room_around
 from vecenv.manipulation.placing import Target, choose_grasp, put_down
 from vecenv.manipulation.world import Margins, World, down_facing, matrix, pinching, spun, tilted, upright, yaw
@@ -34,7 +35,7 @@ TABLE_ALIASES = frozenset(
 HELD_ALIASES = frozenset({"held object", "held_object", "object in hand", "held thing"})
 
 
-class PerceptionError(LookupError):
+class PerceptionError(NotFound):
     """There is no such thing here, or it does not offer what was asked of it."""
 
 

@@ -28,6 +28,7 @@ from vecenv.contract import (
     PointCloud,
     ResetInfo,
 )
+from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.routes import RouteConfig
 from vecenv.manipulation.world import Margins, matrix
@@ -72,7 +73,7 @@ _HOME_REACH = -0.28
 _TABLE_HALF, _TABLE_STEP = 0.5, 0.1
 
 
-class NoHandView(ValueError):
+class NoHandView(InvalidInput):
     """VoxPoser has no view of this suite's robot; the message says of which it has."""
 
 

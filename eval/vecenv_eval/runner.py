@@ -25,6 +25,7 @@ from vecenv import family, protocols
 from vecenv.assets import AssetsMissing
 from vecenv.cli import unknown
 from vecenv.contract import BatchEnv, Control, Metrics, ResetInfo
+from vecenv.errors import InvalidInput
 from vecenv.placement import episode_indices
 from vecenv_eval.conditions import conditions
 from vecenv_eval.episodes import ALL, MAX_SLOTS, Batch, Episode, Suite, parse_tasks, plan
@@ -43,7 +44,7 @@ _SIMPLER_SLOTS = 50
 MAX_IDLE_CALLS = 100
 
 
-class ConfigError(ValueError):
+class ConfigError(InvalidInput):
     """The evaluation was asked for something that does not exist or does not fit together."""
 
 

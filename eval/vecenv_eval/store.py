@@ -18,13 +18,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from vecenv.errors import InvalidFile
 from vecenv_eval.episodes import Episode
 
 CONFIG, EPISODES, ERRORS, SUMMARY, REPORT = "config.json", "episodes.jsonl", "errors.log", "summary.json", "report.md"
 DEMOS = "demos"
 
 
-class StoreError(RuntimeError):
+class StoreError(InvalidFile):
     """A results folder cannot be made, read or gone on with; the message names the file."""
 
 

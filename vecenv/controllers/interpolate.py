@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
+
 # A profile that starts outside the limits brakes in up to two phases; then come seven, then rest.
 NUM_PHASES = 2 + 7 + 1
 
 
-class InterpolationError(ValueError):
+class InterpolationError(InvalidInput):
     """Limits or shapes that no path can be planned with; the message says which."""
 
 

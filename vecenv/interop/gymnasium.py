@@ -29,6 +29,7 @@ from gymnasium.vector.utils import batch_space
 import vecenv
 from vecenv import placement
 from vecenv.contract import ACTION_DIM, Control
+from vecenv.errors import InvalidInput
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.physics.base import Group
 from vecenv.libero.scene.scene import Scene
@@ -44,7 +45,7 @@ _PROPRIO = 8
 Observation: TypeAlias = "np.ndarray | dict[str, np.ndarray]"
 
 
-class GymnasiumError(ValueError):
+class GymnasiumError(InvalidInput):
     """An option that these environments do not have; the message says what would be right."""
 
 

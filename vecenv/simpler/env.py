@@ -21,9 +21,10 @@ import numpy as np
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
-from vecenv.contract import FIRST, SUCCESS_MODES, CameraView, Control, Egocentric, Objects, Rendered, State
+from vecenv.contract import CameraView, Control, Egocentric, Objects, Rendered, State
 from vecenv.controllers.waypoint import Plan
 from vecenv.simpler.assets import files as assets
+from vecenv.simpler.config import SimplerConfig, SimplerError
 from vecenv.simpler.control import kinematics, robots
 from vecenv.simpler.control.kinematics import rotation_from_quat
 from vecenv.simpler.control.servo import Servo, ServoConfig
@@ -31,94 +32,23 @@ from vecenv.simpler.episodes import Episode, prepare, require_drawable
 from vecenv.simpler.judge import Judge, Verdict
 from vecenv.simpler.physics.scenes import instances
 from vecenv.simpler.physics.workers import Job, Sizes, Slots, make_slots
-from vecenv.simpler.published.lists import SEED, EpisodeSpec, check_placement, check_protocol, counts, place, scene_of
+from vecenv.simpler.published.lists import SEED, EpisodeSpec, check_placement, counts, place, scene_of
 from vecenv.simpler.published.lists import episodes as published_episodes
 from vecenv.simpler.tasks import find_task, list_tasks
-from vecenv.simpler.variants import Variant, make_variant, varied
+from vecenv.simpler.variants import make_variant, varied
 from vecenv.slots import SlotBatch
 
 if TYPE_CHECKING:
     from vecenv.simpler.overlay import Pictures
 
-BACKENDS = ("physx_cpu",)
-# What ``vecenv.make`` calls a suite's own CPU physics.
-_NATIVE = "native"
-_NO_CUDA = (
-    "backend='physx_cuda' is not supported: SIMPLER runs on backend='physx_cpu' (the default, also called 'native'), "
-    "spread over processes by num_threads. SAPIEN's GPU physics needs a PhysX library that is no part of its wheel, "
-    "and vecenv's scenes, controllers and criteria have not been written or tested for it; a GPU does draw the pictures"
-)
 # Slot -> its episode and a row of facts.
 _Shown: TypeAlias = dict[int, tuple[Episode, np.void]]
-GRIPPERS = ("native", "binary")
-OVERLAYS = ("background", "none", "blend")
 # Largest action: metres, radians, gripper.
 ACTION_LIMITS = np.array([1.0, 1.0, 1.0, np.pi / 2, np.pi / 2, np.pi / 2, 1.0])
 # LIBERO's name for the third-person camera.
 _CAMERA = "agentview"
 # More objects than any task has.
 _MAX_OBJECTS = 8
-
-
-class SimplerError(ValueError):
-    """An option or call that this environment cannot honour; the message says what would be right."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimplerConfig:
-    """Options of a SIMPLER batch.
-
-    Attributes:
-        backend: ``"physx_cpu"``, also called ``"native"``; ``"physx_cuda"`` is not supported, and says so.
-        num_workers: processes that scenes are spread over; 1 steps them in this one. None: one a core, and no more
-            than slots.
-        gripper: ``"native"``, the robot's own convention; or ``"binary"``, 1 closed and 0 open (above or below one
-            half).
-        max_steps: step budget in control ticks; None for each task's own.
-        success: ``"first"``: an episode ends when its task is first solved; ``"final"``: at the end of its budget,
-            where the verdict is read.
-        servo: speeds and tolerances of ``step_ee_pose``; None for the suite's own.
-        overlay: what replaces the background of pictures: ``"background"``, a photograph, as upstream's visual matching
-            does; ``"none"``; or ``"blend"``, both at one half.
-        shadows: whether lights cast shadows; upstream's do not, except at variant aggregation's cabinets, where they do
-            here too.
-        variant: what is different from visual matching's scenes; None for nothing.
-        protocol: which episodes there are, one of ``published.PROTOCOLS``: ``"seed"``, 50 of every task, or one of
-            upstream's lists, which decide robots, scenes, pictures and budgets.
-        assets: root of the asset tree; None for where ``vecenv assets pull simpler`` puts it.
-    """
-
-    backend: str = "physx_cpu"
-    num_workers: int | None = None
-    gripper: str = "native"
-    max_steps: int | None = None
-    success: str = FIRST
-    servo: ServoConfig | None = None
-    overlay: str = "background"
-    shadows: bool = False
-    variant: Variant | None = None
-    protocol: str = SEED
-    assets: Path | None = None
-
-    def __post_init__(self) -> None:
-        if self.backend == "physx_cuda":
-            raise SimplerError(_NO_CUDA)
-        if self.backend == _NATIVE:
-            object.__setattr__(self, "backend", BACKENDS[0])
-        for name, allowed in (
-            ("backend", BACKENDS),
-            ("gripper", GRIPPERS),
-            ("overlay", OVERLAYS),
-            ("success", SUCCESS_MODES),
-        ):
-            if getattr(self, name) not in allowed:
-                raise SimplerError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
-        if check_protocol(self.protocol) != SEED and self.variant is not None:
-            raise SimplerError(f"variant={self.variant}: protocol {self.protocol!r} says itself what varies")
-        for name in ("num_workers", "max_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise SimplerError(f"{name}={value}: need at least 1, or None")
 
 
 class SimplerEnv(SlotBatch):

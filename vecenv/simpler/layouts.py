@@ -20,6 +20,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.simpler.tasks import DRAWERS, FIRST_SEED, NUM_EPISODES, ORIENTATIONS, SimplerTask
 
 Vector = tuple[float, float, float]
@@ -35,7 +36,7 @@ _LIGHT_FRUIT = ("apple", "baked_apple", "baked_apple_v2", "orange")
 _LIGHT_DENSITY = 200.0
 
 
-class LayoutError(ValueError):
+class LayoutError(InvalidInput):
     """A seed or episode that does not exist; the message says which do."""
 
 

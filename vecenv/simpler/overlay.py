@@ -24,6 +24,7 @@ import numpy as np
 import sapien
 from PIL import Image
 
+from vecenv.errors import SimulationError
 from vecenv.simpler.episodes import Episode, drawn_stage, require_drawable
 from vecenv.simpler.physics.scenes import CABINET, ROBOT, Scene, SceneSpec, instances
 from vecenv.simpler.tasks import Camera, Lighting
@@ -37,7 +38,7 @@ _FLOOR_HALF = [10.0, 10.0, 0.017]
 _TWINS = 12
 
 
-class RendererMissing(RuntimeError):
+class RendererMissing(SimulationError):
     """There is no usable Vulkan driver; the message says what to install."""
 
 

@@ -20,6 +20,7 @@ from typing import Any, SupportsIndex
 
 import numpy as np
 
+from vecenv.errors import InvalidFile, NotFound
 from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX, Robot
 
 BRIDGE, GOOGLE = "simpler/bridge", "simpler/google_robot"
@@ -35,18 +36,18 @@ DRAWERS = ("top", "middle", "bottom")
 ORIENTATIONS = ("upright", "laid_vertically", "lr_switch")
 
 
-class UnknownSuite(KeyError):
+class UnknownSuite(NotFound, KeyError):
     """No SIMPLER suite has this name; the message lists those that exist."""
 
     def __str__(self) -> str:
         return str(self.args[0])
 
 
-class UnknownTask(LookupError):
+class UnknownTask(NotFound):
     """A suite has no task of this name or index; the message gives the nearest or the valid range."""
 
 
-class ModelDataError(RuntimeError):
+class ModelDataError(InvalidFile):
     """A file with sizes and densities is missing or not what it should be; the message names it."""
 
 

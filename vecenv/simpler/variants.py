@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from vecenv.assets import AssetsMissing
+from vecenv.errors import InvalidInput
 from vecenv.simpler.assets.files import NAME, how_to_get
 from vecenv.simpler.layouts import Layout, Placed
 from vecenv.simpler.tasks import DATA, DirectionalLight, Lighting, SimplerTask, Stage
@@ -29,7 +30,7 @@ _COKE = "opened_coke_can"
 _AMBIENT = (0.3, 0.3, 0.3)
 
 
-class VariantError(ValueError):
+class VariantError(InvalidInput):
     """A variant that does not exist or does not fit a task; the message says what does."""
 
 

@@ -37,6 +37,7 @@ from typing import Any
 
 import platformdirs
 
+from vecenv.errors import ServiceError
 from voxposer.sandbox.guard import HostFault
 
 VARIABLE = "VECENV_CACHE_DIR"
@@ -59,7 +60,7 @@ _TRANSIENT = (
 )
 
 
-class LlmError(HostFault):
+class LlmError(ServiceError, HostFault):
     """A question that the model did not answer.
 
     Attributes:

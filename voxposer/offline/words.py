@@ -11,6 +11,8 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from vecenv.errors import InvalidInput
+
 
 def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
@@ -52,7 +54,7 @@ _IRREGULAR = {"shelves": "shelf", "knives": "knife", "boxes": "box", "dishes": "
 _NOT_PLURAL = _words("gas glass less plus lens alias")
 
 
-class NotUnderstood(ValueError):
+class NotUnderstood(InvalidInput):
     """The offline writer has no program for a query; the message says which words it stopped at."""
 
 

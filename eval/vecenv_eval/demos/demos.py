@@ -32,6 +32,7 @@ import vecenv
 from vecenv import protocols
 from vecenv.assets import AssetsMissing
 from vecenv.contract import ACTION_DIM
+from vecenv.errors import InvalidInput
 from vecenv.libero.scene.arenas import ARENAS
 from vecenv.libero.tasks.suites import NUM_EPISODES, TaskSpec, list_suites, list_tasks
 from vecenv.libero.tasks.suites import task as find_spec
@@ -68,7 +69,7 @@ _DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError
 Pose = tuple[np.ndarray, np.ndarray]
 
 
-class DemoError(ValueError):
+class DemoError(InvalidInput):
     """A demonstration file, or one demonstration in it, cannot be used; the message names both and what is wrong."""
 
 

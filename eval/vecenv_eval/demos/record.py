@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from vecenv.contract import BatchEnv, State
+from vecenv.errors import InvalidFile
 from vecenv_eval.demos.demos import Recording
 
 
-class RecordError(RuntimeError):
+class RecordError(InvalidFile):
     """An environment whose executed actions cannot be seen."""
 
 

@@ -22,6 +22,7 @@ from rich.text import Text
 import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.contract import ACTION_DIM, Control
+from vecenv.errors import InvalidInput
 from vecenv_eval.demos.demos import SUFFIXES, Demo, DemoError, MadeStart, StoredStart, Unreadable, read_demos
 from vecenv_eval.demos.record import flat_state
 from vecenv_eval.report import CONFIDENCE, wilson
@@ -29,7 +30,7 @@ from vecenv_eval.report import CONFIDENCE, wilson
 NO_FIXTURES = "no model_file: fixtures at their centres"
 
 
-class ReplayError(ValueError):
+class ReplayError(InvalidInput):
     """There is nothing to replay; the message says what was looked for."""
 
 

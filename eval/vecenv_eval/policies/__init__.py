@@ -15,6 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control, ResetInfo
+from vecenv.errors import InvalidInput
 
 BUILTIN = {
     "pick_place": "vecenv_eval.policies.pick_place:PickPlacePolicy",
@@ -25,7 +26,7 @@ BUILTIN = {
 }
 
 
-class PolicyError(ValueError):
+class PolicyError(InvalidInput):
     """A policy cannot be made: unknown name, a module that does not import, or arguments it does not take."""
 
 

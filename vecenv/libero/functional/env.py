@@ -33,6 +33,7 @@ from mujoco import mjx
 from vecenv.controllers import gripper as gripper_control
 from vecenv.controllers import joint as joint_control
 from vecenv.controllers import kinematics
+from vecenv.errors import InvalidInput
 from vecenv.libero.functional.objectives import OBJECTIVES, Objective, View
 from vecenv.libero.functional.starts import Begin, Starts
 from vecenv.libero.physics import budgets
@@ -70,7 +71,7 @@ _BUDGET_STARTS = 64
 _ROBOT = 9
 
 
-class FunctionalError(ValueError):
+class FunctionalError(InvalidInput):
     """An option that this environment cannot honour; the message says what would be right."""
 
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.scene import Scene
@@ -36,7 +37,7 @@ _GRASP_DEPTH = 0.03
 _GRASP_RADIUS = 0.03
 
 
-class ObjectiveError(ValueError):
+class ObjectiveError(InvalidInput):
     """An objective that the scene does not offer; the message says what would be right."""
 
 

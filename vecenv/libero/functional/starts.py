@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.libero.scene import surface
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.scene import Entity, Scene
@@ -35,7 +36,7 @@ LAYOUTS = 64
 _FLARE = 0.9
 
 
-class StartError(ValueError):
+class StartError(InvalidInput):
     """Starts that cannot be drawn; the message says why."""
 
 

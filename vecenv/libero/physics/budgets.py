@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 import mujoco
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.libero.physics.base import Group, Start
 from vecenv.libero.scene import cache
 from vecenv.libero.scene.scene import CONTACT_LIMIT, PAIR_LIMIT, Scene
@@ -41,7 +42,7 @@ _CLEARANCE = 0.12
 _REACH = 0.05
 
 
-class BudgetError(ValueError):
+class BudgetError(InvalidInput):
     """A budget that cannot be used; the message names the number."""
 
 

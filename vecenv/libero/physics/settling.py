@@ -16,6 +16,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from vecenv.errors import SimulationError
 from vecenv.libero.physics.base import SETTLE_ACTION, SETTLE_TICKS, Start
 from vecenv.libero.scene import cache
 from vecenv.libero.scene.scene import Scene
@@ -25,7 +26,7 @@ from vecenv.libero.tasks.settled import TIME
 VERSION = 1
 
 
-class SettlingError(RuntimeError):
+class SettlingError(SimulationError):
     """A start that does not come to rest; the message names the row and what failed."""
 
 

@@ -30,6 +30,7 @@ import mujoco
 import numpy as np
 
 from vecenv.contract import CameraView
+from vecenv.errors import SimulationError
 from vecenv.libero.render.displays import egl_context
 from vecenv.libero.render.drawing import Pose, Stage, View, camera_view
 from vecenv.libero.render.options import RenderError, UserCamera, VisualOptions
@@ -48,7 +49,7 @@ _AS_CODES = (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR)
 _opening = threading.Lock()
 
 
-class GlError(RuntimeError):
+class GlError(SimulationError):
     """There is no GL to draw with, or it failed; the message says what would help."""
 
 

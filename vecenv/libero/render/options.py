@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
+
 # Names that policies use for MuJoCo's cameras.
 ALIASES: Mapping[str, str] = MappingProxyType({"wrist": "robot0_eye_in_hand"})
 # The two that VLA policies are trained on, in their order.
@@ -24,7 +26,7 @@ COLORS = ("published", "current")
 LARGEST_SIDE = 4096
 
 
-class RenderError(ValueError):
+class RenderError(InvalidInput):
     """A camera, instance, texture or option that does not exist; the message names it and what there is."""
 
 

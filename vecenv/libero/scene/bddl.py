@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
+from vecenv.errors import InvalidInput
+
 MAX_CHARS = 1 << 18
 """Longest accepted text; the longest real file has 4,396 characters."""
 MAX_DEPTH = 64
@@ -46,7 +48,7 @@ _TERM = re.compile(r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?|np\.pi|pi|[-+
 _SHOWN_CHARS = 40
 
 
-class BDDLError(ValueError):
+class BDDLError(InvalidInput):
     """A task file that is not well-formed LIBERO BDDL.
 
     Attributes:

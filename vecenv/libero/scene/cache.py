@@ -31,6 +31,7 @@ import mujoco
 import numpy as np
 import platformdirs
 
+from vecenv.errors import InvalidFile
 from vecenv.libero.scene.arenas import ARENAS
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.contacts import Contacts
@@ -45,7 +46,7 @@ FORMAT = 2
 _FILE = re.compile(r' file="([^"]*)"')
 
 
-class SceneFileError(RuntimeError):
+class SceneFileError(InvalidFile):
     """A stored scene is missing, damaged, or made by another version of MuJoCo; the message names the file."""
 
 

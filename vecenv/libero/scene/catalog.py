@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from vecenv.errors import NotFound
+
 _FAMILIES = ("stable_hope_objects", "stable_scanned_objects", "turbosquid_objects", "custom_objects")
 # Categories whose file is not named after them.
 _FILE_NAMES = {"rack": "simple_rack"}
 
 
-class UnknownCategory(KeyError):
+class UnknownCategory(NotFound, KeyError):
     """A BDDL file asks for an object category that the asset tree does not have; the message names it."""
 
     def __str__(self) -> str:

@@ -25,6 +25,8 @@ from typing import Any, Literal, TypeAlias, cast
 
 import mujoco
 
+from vecenv.errors import InvalidInput
+
 Contacts: TypeAlias = Literal["published", "current"]
 CONTACTS: tuple[Contacts, ...] = ("published", "current")
 # The custom number, which comes first in a model, and its value for published contacts: a random one, which no other
@@ -42,7 +44,7 @@ OPTIONS: dict[Contacts, dict[str, Any]] = {
 MESH_MARGIN = 1e-12
 
 
-class ContactsError(ValueError):
+class ContactsError(InvalidInput):
     """A value that ``contacts`` cannot have; the message lists the allowed ones."""
 
 

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.libero.scene import catalog
 from vecenv.libero.scene.arenas import ARENAS
 from vecenv.libero.scene.bddl import Predicate, Problem
@@ -38,7 +39,7 @@ _REGION_ABOVE = 0.10
 _BOX_BELOW = 0.01
 
 
-class GoalError(ValueError):
+class GoalError(InvalidInput):
     """A goal cannot be evaluated in its scene; the message names the predicate and what would be right."""
 
 

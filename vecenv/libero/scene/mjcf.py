@@ -12,13 +12,15 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from pathlib import Path
 
+from vecenv.errors import InvalidInput
+
 # Attributes that name an element or refer to one by name, in the elements that occur in these assets.
 _NAME_ATTRIBUTES = ("name", "material", "texture", "mesh", "joint", "site", "body1", "body2")
 # Containers that are concatenated when two files are joined.
 _SECTIONS = ("actuator", "sensor", "tendon", "equality", "contact")
 
 
-class MjcfError(ValueError):
+class MjcfError(InvalidInput):
     """An asset file is not the MJCF that robosuite's conventions ask for; the message names the file."""
 
 

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from vecenv import assets
+from vecenv.errors import InvalidInput
 from vecenv.libero.scene import catalog, contacts, mjcf
 from vecenv.libero.scene.arenas import ARENAS, Arena
 from vecenv.libero.scene.bddl import Problem, Region
@@ -45,7 +46,7 @@ CONTACT_LIMIT, PAIR_LIMIT = "max_contact_points", "max_geom_pairs"
 _ZONE_HALF_HEIGHT = 0.007
 
 
-class SceneError(ValueError):
+class SceneError(InvalidInput):
     """A problem cannot be turned into a model; the message names the problem file and the reason."""
 
 

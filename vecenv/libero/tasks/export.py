@@ -21,6 +21,7 @@ from typing import Any, TypeAlias
 import mujoco
 import numpy as np
 
+from vecenv.errors import InvalidFile
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import Problem, SceneKey, parse_problem
 from vecenv.libero.scene.cache import SceneFileError, compiled_source, content_key, read_scene, write_file, write_scene
@@ -38,7 +39,7 @@ FORMAT = 3
 Track: TypeAlias = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
-class ExportError(RuntimeError):
+class ExportError(InvalidFile):
     """An exported folder cannot be written or used; the message names the file and says what to do."""
 
 

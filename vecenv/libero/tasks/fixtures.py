@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.libero.scene.bddl import Problem, Region
 from vecenv.libero.scene.scene import Entity, Scene
 from vecenv.libero.tasks import resets
@@ -22,7 +23,7 @@ from vecenv.protocols import ResetLoop
 MODES = ("center", "sampled", "upstream")
 
 
-class FixtureError(ValueError):
+class FixtureError(InvalidInput):
     """A fixture pose cannot be used; the message names the fixture and what would be right."""
 
 

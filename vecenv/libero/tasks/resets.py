@@ -26,6 +26,7 @@ from typing import TypeAlias
 import mujoco
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.libero.scene import catalog
 from vecenv.libero.scene.bddl import Predicate, Problem, Region
 from vecenv.libero.scene.scene import Entity, Scene
@@ -48,7 +49,7 @@ _JOINT_RANGES = {"open": "open_range", "close": "close_range", "turnon": "on_ran
 _AXES = ("x", "y", "z")
 
 
-class ResetError(ValueError):
+class ResetError(InvalidInput):
     """A task that upstream could not reset; the message names it and what is wrong."""
 
 

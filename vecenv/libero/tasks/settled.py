@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vecenv.errors import InvalidFile
 from vecenv.libero.tasks.suites import TaskSpec
 
 FOLDER = Path(__file__).parent / "settled_starts"
@@ -24,7 +25,7 @@ FOLDER = Path(__file__).parent / "settled_starts"
 TIME = 0.5
 
 
-class SettledStartsError(RuntimeError):
+class SettledStartsError(InvalidFile):
     """The settled starts of a task are missing, damaged, or belong to other init states; the message says which."""
 
 

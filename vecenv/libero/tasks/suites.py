@@ -23,6 +23,7 @@ from typing import SupportsIndex
 import numpy as np
 
 from vecenv.assets import libero_root
+from vecenv.errors import InvalidFile, NotFound
 from vecenv.libero.scene.bddl import Problem, load_problem
 
 BASE_SUITES: tuple[str, ...] = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
@@ -46,18 +47,18 @@ _TASK_MAP_NAME = "libero_task_map"
 _SCENE_PREFIX = re.compile(r"^[A-Z].*?SCENE\d+_")
 
 
-class UnknownSuite(KeyError):
+class UnknownSuite(NotFound, KeyError):
     """No suite has this name; the message lists those that exist and the nearest one."""
 
     def __str__(self) -> str:
         return str(self.args[0])
 
 
-class UnknownTask(IndexError):
+class UnknownTask(NotFound, IndexError):
     """A suite has no task of this index; the message gives the valid range."""
 
 
-class TaskDataError(RuntimeError):
+class TaskDataError(InvalidFile):
     """A file of an installed suite is missing or not what it should be; the message names it.
 
     Attributes:

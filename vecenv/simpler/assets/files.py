@@ -22,6 +22,7 @@ import platformdirs
 import typer
 
 from vecenv.assets import AssetRow, AssetsMissing
+from vecenv.errors import InvalidFile
 
 VARIABLE = "VECENV_SIMPLER_ASSETS"
 NAME = "SIMPLER meshes, pictures and robots"
@@ -36,7 +37,7 @@ _MODELS = PurePosixPath("data/custom/models")
 _VISUALS = ("textured.obj", "textured.dae", "textured.glb")
 
 
-class ManifestError(RuntimeError):
+class ManifestError(InvalidFile):
     """The list of files is damaged or names a path outside the tree; the message says which."""
 
 

@@ -31,6 +31,7 @@ from urllib.parse import quote
 import httpx
 import tenacity
 
+from vecenv.errors import ServiceError
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.assets.files import Entry, Manifest, read_manifest
 
@@ -44,15 +45,15 @@ _PATIENCE = 3
 _PARTIAL = ".partial"
 
 
-class PullError(RuntimeError):
+class PullError(ServiceError):
     """The folder or the source cannot be used; the message says why."""
 
 
-class NotThere(RuntimeError):
+class NotThere(ServiceError):
     """A source does not have a file, or refuses it; asking again is no use."""
 
 
-class Broken(RuntimeError):
+class Broken(ServiceError):
     """A transfer broke off or brought the wrong content; asking again may help."""
 
 

@@ -23,8 +23,10 @@ import numba
 import numpy as np
 from numba import types
 
+from vecenv.errors import InvalidInput
 
-class KinematicsError(ValueError):
+
+class KinematicsError(InvalidInput):
     """A robot description that cannot be used, or arrays of the wrong shape; the message names the part."""
 
 

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vecenv.controllers.interpolate import Limits, Planner
+from vecenv.errors import InvalidInput
 from vecenv.simpler.control.kinematics import (
     Chain,
     quat_from_rotation,
@@ -35,7 +36,7 @@ _DESCRIPTIONS = PurePosixPath("mani_skill2_real2sim/assets/descriptions")
 ACTION_DIM = 7
 
 
-class RobotError(ValueError):
+class RobotError(InvalidInput):
     """Arrays of the wrong shape, or a URDF version that a robot does not have; the message says which."""
 
 

@@ -14,8 +14,10 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from vecenv.errors import InvalidInput
 
-class MeshError(ValueError):
+
+class MeshError(InvalidInput):
     """A collision mesh that cannot be read; the message names the file."""
 
 

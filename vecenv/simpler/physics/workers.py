@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
+from vecenv.errors import SimulationError
 from vecenv.simpler.physics.scenes import Scene, SceneSpec, Start, facts_dtype
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ Orders: TypeAlias = "Mapping[int, tuple[Subject, np.void]]"
 _SPARE = 8
 
 
-class WorkerError(RuntimeError):
+class WorkerError(SimulationError):
     """A worker process failed or went away; the message carries its traceback."""
 
 

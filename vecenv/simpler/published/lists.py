@@ -40,6 +40,7 @@ from typing import Any
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.placement import Placement, PlacementError, cross
 from vecenv.simpler.layouts import Choices, Layout, drawn, episode_seed, lay_out, unseeded_seeds
 from vecenv.simpler.published.specs import (
@@ -83,7 +84,7 @@ __all__ = [
 ]
 
 
-class PublishedError(ValueError):
+class PublishedError(InvalidInput):
     """A protocol that does not exist, or a task that it has no episodes of; the message says what there is."""
 
 

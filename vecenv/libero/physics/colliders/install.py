@@ -24,6 +24,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
+from vecenv.errors import SimulationError
 from vecenv.libero.physics.colliders import boxbox, planemesh
 from vecenv.libero.scene.contacts import MARK, mark
 from vecenv.util.compiled import address_at, builtin, compile_for_c, floats_at, int32_at, part
@@ -38,7 +39,7 @@ _SYMBOL = "vecenv_collider_layout"
 _LOCK = threading.Lock()
 
 
-class ColliderError(RuntimeError):
+class ColliderError(SimulationError):
     """This MuJoCo's collision table cannot be used; the message says what was found and what to do."""
 
 

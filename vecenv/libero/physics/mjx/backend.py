@@ -28,6 +28,7 @@ from mujoco import mjx
 
 from vecenv.controllers import gripper as gripper_control
 from vecenv.controllers import kinematics, osc, waypoint
+from vecenv.errors import InvalidInput
 from vecenv.libero.physics import budgets, newton
 from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Followed, Physics, Ran, Start, Watcher
 from vecenv.libero.physics.mjx import contacts as mjx_contacts
@@ -47,7 +48,7 @@ _TOLERANCES = ("tolerance", "ls_tolerance")
 _HUGE = mujoco.mjMAXVAL
 
 
-class MjxError(ValueError):
+class MjxError(InvalidInput):
     """A backend, device or scene that MJX cannot serve; the message says what would be right."""
 
 

@@ -24,6 +24,7 @@ import mujoco
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver as jax_driver
 
+from vecenv.errors import SimulationError
 from vecenv.libero.physics.colliders import boxbox_jax
 from vecenv.libero.scene.contacts import MARK, MESH_MARGIN
 
@@ -34,7 +35,7 @@ _BOXES_ARE_PRIMITIVE = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
 _LOCK = threading.Lock()
 
 
-class MjxContactsError(RuntimeError):
+class MjxContactsError(SimulationError):
     """Published contacts cannot be had from this MJX; the message says what was found and what to do."""
 
 

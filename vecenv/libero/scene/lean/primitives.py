@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
+
 BOX, CAPSULE, CYLINDER, HULL = "box", "capsule", "cylinder", "hull"
 
 # Corner signs of a box, [8, 3].
@@ -26,7 +28,7 @@ _SECTION_CELLS = 60
 _ROUND_SIDES = 24
 
 
-class FitError(ValueError):
+class FitError(InvalidInput):
     """Solids to which a shape cannot be fitted; the message says why."""
 
 
