@@ -17,6 +17,7 @@ import vecenv
 from vecenv.actions import GRIPPER
 from vecenv.assets import AssetsMissing
 from vecenv.contract import BatchEnv
+from vecenv.controllers.waypoint import WaypointConfig
 from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX
 
 BRIDGE, GOOGLE = "simpler/bridge", "simpler/google_robot"
@@ -80,10 +81,10 @@ def test_a_simpler_task_is_made_by_name(small: Path) -> None:
 @pytest.mark.parametrize(
     ("suite", "options", "says"),
     [
-        (BRIDGE, {"geometry": "lean"}, "simpler/bridge has no option geometry='lean'; its own: gripper"),
+        (BRIDGE, {"geometry": "lean"}, "simpler/bridge has no option geometry='lean'; its own: .*gripper"),
         (BRIDGE, {"start": "raw", "settle_steps": 3}, "no option start='raw', settle_steps=3"),
         (GOOGLE, {"fixtures": {"table": ([0, 0, 0], [1, 0, 0, 0])}}, "no option fixtures="),
-        ("libero_goal", {"gripper": "binary"}, "libero_goal has no option gripper='binary'; its own: geometry"),
+        ("libero_goal", {"gripper": "binary"}, "libero_goal has no option gripper='binary'; its own: .*geometry"),
         ("libero_goal", {"overlay": "none", "shadows": True}, "no option overlay='none', shadows=True"),
     ],
 )
@@ -161,7 +162,7 @@ def test_bad_numbers_are_mended_and_said(env: BatchEnv) -> None:
     actions = np.zeros((2, 7))
     actions[1] = [np.nan, 5.0, 0.0, 0.0, 0.0, np.inf, 0.0]
     control = env.step_continuous(actions)
-    assert control.info["mended"].tolist() == [False, True]
+    assert control.info["sanitized"].tolist() == [False, True]
     assert control.info["fault"] == ("", "")
     with pytest.raises(ValueError, match=r"expected \[2, 7\]"):
         env.step_continuous(np.zeros((2, 6)))
@@ -192,3 +193,64 @@ def test_the_table_of_gripper_signs_is_what_happens(small: Path, suite: str, tas
     opening = env.observe_egocentric().state[:, list(robot.gripper)].sum(axis=1) * (1 if suite == BRIDGE else -1)
     assert opening[0] > opening[1] + 0.02
     env.close()
+
+
+# -- options -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"render": True}, r"libero_goal.*render.*Mapping\[str, Any\] \| RenderConfig"),
+        ({"render": {"lods": "fast"}}, "render has no option lods='fast'; did you mean lod"),
+        ({"render": {"lod": 3}}, "render.*lod"),
+        ({"max_steps": "many"}, "max_steps.*many"),
+        ({"max_steps": True}, "max_steps=True"),
+        ({"waypoint": {"pos_tol": "near"}}, "pos_tol"),
+        ({"seed": 1.5}, "seed"),
+        ({"num_devices": 0}, "num_devices=0: need at least 1"),
+        ({"max_stps": 4}, r"no option max_stps=4; did you mean max_steps\?"),
+    ],
+)
+def test_a_mistyped_option_is_refused_at_make_with_its_type(options: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        vecenv.make("libero_goal", task=0, episodes=[0], **options)
+
+
+def test_simpler_refuses_a_seed_for_its_episodes_depend_on_their_number_alone(small: Path) -> None:
+    with pytest.raises(vecenv.OptionError, match="simpler/bridge has no option seed=3"):
+        vecenv.make(BRIDGE, task=SPOON, episodes=[0], assets=small, seed=3)
+
+
+def test_what_is_given_comes_before_the_protocol_and_the_protocol_before_defaults() -> None:
+    config = vecenv.LiberoConfig(protocol="openvla", render={"lod": "fast"})
+    rules = config.rules("libero_goal")
+    assert (rules.max_steps, rules.start, rules.fixtures) == (300, "raw", "upstream")
+    assert (rules.render.lod, rules.render.height) == ("fast", 256)
+    given = vecenv.LiberoConfig(protocol="openvla", max_steps=7, start="settled", fixtures="center").rules(
+        "libero_goal"
+    )
+    assert (given.max_steps, given.start, given.fixtures) == (7, "settled", "center")
+    # The default of the protocol "seed" given on purpose is not taken for "not given".
+    assert vecenv.LiberoConfig(protocol="openvla", max_steps=2500).rules("libero_goal").max_steps == 2500
+
+
+def test_a_config_is_taken_whole_and_fields_replace_parts_of_it() -> None:
+    config = vecenv.LiberoConfig(max_steps=9, waypoint=WaypointConfig(pos_tol=0.02))
+    env = vecenv.make("libero_goal", task=0, episodes=[0], config=config, max_steps=4)
+    assert env.reset().max_steps.tolist() == [4]
+    assert isinstance(env.config, vecenv.LiberoConfig)
+    assert env.config.waypoint.pos_tol == 0.02
+    assert env.control_hz == 20
+    env.close()
+    with pytest.raises(vecenv.OptionError, match="config is a LiberoConfig, expected SimplerConfig"):
+        vecenv.make(BRIDGE, task=SPOON, config=config)
+
+
+def test_the_public_mask_says_which_slots_are_done(env: BatchEnv) -> None:
+    env.reset()
+    assert env.done.tolist() == [False, False]
+    env.step_continuous(np.zeros((2, 3, 7)))
+    assert env.done.tolist() == [True, True]
+    assert len(env.instructions()) == 2
+    assert env.placement.episode.tolist() == [0, 1]

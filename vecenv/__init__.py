@@ -1,72 +1,69 @@
 """Batched robot-manipulation environments: the LIBERO and SIMPLER benchmarks behind one set of verbs.
 
-``make`` returns an environment; ``vecenv.contract`` says what it promises. A suite's name comes in; which library
-runs it is decided here, and only that one is imported.
+``make`` returns an environment; ``vecenv.contract`` says what it promises. ``vecenv.registry`` knows which package runs
+a suite, and only that one is imported.
 """
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from vecenv.errors import InvalidInput, MissingDependency
+from vecenv import registry
+from vecenv.errors import VecenvError
+from vecenv.registry import ExtraMissing, OptionError, TaskInfo
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vecenv.contract import BatchEnv
-    from vecenv.libero.physics.budgets import Budget
+    from vecenv.libero.config import LiberoConfig
     from vecenv.libero.render.options import RenderConfig
-    from vecenv.protocols import Protocol, ResetLoop
-    from vecenv.simpler.variants import Variant
+    from vecenv.simpler.config import SimplerConfig
 
 __version__ = "0.1.0"
-__all__ = ["ExtraMissing", "OptionError", "eval_metadata", "list_suites", "list_tasks", "make"]
+__all__ = [
+    "ExtraMissing",
+    "LiberoConfig",
+    "OptionError",
+    "RenderConfig",
+    "SimplerConfig",
+    "VecenvError",
+    "eval_metadata",
+    "family",
+    "list_suites",
+    "list_tasks",
+    "make",
+]
 
-FAMILIES = ("libero", "simpler")
-_SIMPLER = "simpler"
-# What SIMPLER imports and the core does not need.
-_SIMPLER_EXTRA = ("sapien", "ruckig", "trimesh", "PIL")
+# Imported when they are asked for: they bring MuJoCo or SciPy with them.
+_LATER: Mapping[str, str] = {
+    "LiberoConfig": "vecenv.libero.config",
+    "RenderConfig": "vecenv.libero.render.options",
+    "SimplerConfig": "vecenv.simpler.config",
+}
 
 
-class OptionError(InvalidInput):
-    """An option of ``make`` that this kind of suite does not have; the message names both."""
-
-
-class ExtraMissing(MissingDependency):
-    """A suite needs packages that are not installed; the message has the pip command."""
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_LATER[name]), name)
 
 
 def make(
     suite: str,
     *,
-    task: Any = None,
-    tasks: Any = None,
-    episodes: Any = None,
-    protocol: str = "seed",
-    backend: str = "native",
-    max_steps: int | None = None,
-    success: str | None = None,
-    seed: int | None = None,
-    num_threads: int | None = None,
-    geometry: str = "exact",
-    contacts: str = "published",
-    fixtures: Any = None,
-    reset_loop: ResetLoop | Mapping[str, Any] | None = None,
-    start: str | None = None,
-    settle_steps: int | None = None,
-    num_devices: int = 1,
-    budget: Budget | None = None,
-    render: RenderConfig | None = None,
-    scenes: str | Path | None = None,
-    gripper: str = "native",
-    overlay: str = "background",
-    shadows: bool = False,
-    variant: Variant | Mapping[str, Any] | None = None,
-    assets: str | Path | None = None,
+    task: int | str | None = None,
+    tasks: object = None,
+    episodes: object = None,
+    config: LiberoConfig | SimplerConfig | None = None,
+    **fields: object,
 ) -> BatchEnv:
     """A batch of episodes: every one of ``episodes`` of every one of ``tasks``, task by task, one a slot.
+
+    Options are the fields of the family's config, ``LiberoConfig`` or ``SimplerConfig``, which document them and hold
+    their defaults: ``make("libero_goal", task=3, backend="warp", geometry="lean", render={"lod": "fast"})``. An option
+    that is not given is decided by the evaluation protocol (``protocol=``, see ``vecenv.protocols``) or has its
+    default.
 
     Args:
         suite: one of ``list_suites()``.
@@ -74,132 +71,32 @@ def make(
         tasks: several tasks; all tasks of the suite when neither is given. In LIBERO also ``"0,3,5-7"``.
         episodes: as for ``vecenv eval``: ``"all"``, ``"5"`` for the first five, or ``"0,3,5-7"``; also a sequence of
             indices, or a mapping task index -> any of these. The protocol's by default, and no bare number.
-        backend: ``"native"``: physics on the CPU, the suite's own simulator: MuJoCo on threads in float64 for LIBERO,
-            SAPIEN's PhysX in worker processes (also called ``"physx_cpu"``) for SIMPLER. LIBERO only: ``"warp"``: MJX
-            on MuJoCo Warp (NVIDIA GPUs; also runs on a CPU); ``"jax"``: MJX in pure JAX, any device; ``"mjx"``: warp on
-            CUDA, jax elsewhere.
-        protocol: the evaluation protocol that options come from where they are not given, ``max_steps``, ``success``,
-            ``seed``, ``fixtures``, ``reset_loop``, ``start``, ``settle_steps``, ``episodes`` and the size of images
-            among them; one of ``vecenv.protocols``. ``"seed"`` is this project's own: in LIBERO 2,500 ticks from
-            settled starts, in SIMPLER seeds 2022 to 2071.
-        max_steps: step budget in control ticks (LIBERO: 20 a second); SIMPLER's tasks have their own.
-        success: ``"first"``: an episode ends when its goal first holds; ``"final"``: it goes on to the end of its
-            budget, and the verdict is read there. ``evaluate`` reports both.
-        seed: see ``fixtures``; SIMPLER's episodes depend on their number alone.
-        num_threads: threads of LIBERO's native backend, worker processes of SIMPLER; None for one a core.
-        geometry: LIBERO. ``"exact"``: the collision geometry of upstream. ``"lean"``: at most 24 fitted geoms a scene.
-        contacts: LIBERO. ``"published"``: those of MuJoCo 2.3 to 3.3, under which LIBERO's data and checkpoints were
-            made and scored. ``"current"``: those of the installed MuJoCo.
-        fixtures: LIBERO. Where fixtures stand, which init states don't say: ``"center"`` of their region, ``"sampled"``
-            from it (a function of seed, suite, task and episode), ``"upstream"``: where upstream's ``env.seed(seed)``
-            and the resets of an evaluation script put them, or name -> (pos [3] or [B, 3], quat wxyz [4] or [B, 4]).
-        reset_loop: LIBERO, for ``fixtures="upstream"``: how that script seeds and resets, a
-            ``vecenv.protocols.ResetLoop`` or a mapping of its fields; seeded once a task, one reset an episode by
-            default.
-        start: LIBERO. ``"settled"``: init states at rest, as MuJoCo 3.3.0 settles them; ``"raw"``: init states as
-            stored, followed by ``settle_steps``.
-        settle_steps: LIBERO, for ``"raw"``: control ticks without motion, gripper opening, before an episode begins.
-        num_devices: LIBERO. Devices that MJX spreads the slots over.
-        budget: LIBERO. Contact and constraint memory on MJX; None measures each scene once and remembers it.
-        render: LIBERO. Size, level of detail and colours of camera images, cameras of one's own; 256 x 256 and
-            upstream's picture as LIBERO was published with by default. Nothing is rendered that is not read.
-        scenes: LIBERO. A folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and
-            no LIBERO or robosuite files are needed. Otherwise from the installed packages.
-        gripper: SIMPLER. ``"native"``: the robot's own convention, WidowX +1 open and -1 closed, Google Robot +1 closes
-            and -1 opens; ``"binary"``: 1 closed and 0 open. ``vecenv.actions`` has the table.
-        overlay: SIMPLER. What replaces the background of pictures: ``"background"``, a photograph, as upstream's visual
-            matching does; ``"none"``; or ``"blend"``, both at one half.
-        shadows: SIMPLER. Whether lights cast shadows; upstream's do not.
-        variant: SIMPLER. What differs from visual matching's scenes (light, camera, cabinet, table, distractors): a
-            ``vecenv.simpler.variants.Variant`` or a mapping of its fields.
-        assets: SIMPLER. Root of the asset tree; None for where ``vecenv assets pull simpler`` puts it
-            (``VECENV_SIMPLER_ASSETS`` names another).
+        config: options to start from; ``fields`` replace some of them.
+        **fields: options by their name; a nested config may be a mapping of its fields.
 
     Raises:
-        OptionError: an option that suites of this kind do not have.
+        OptionError: an option that suites of this kind do not have, or a value of a wrong type.
         ProtocolError: a protocol that they do not have.
         ExtraMissing: SIMPLER's packages are not installed.
         AssetsMissing: its files are not there.
         KeyError, ValueError, RuntimeError: subclasses that name the suite, task, option or asset that is wrong.
     """
-    from vecenv import protocols
+    from vecenv.util import configs
 
-    chosen = protocols.protocol(protocol, family(suite))
-    common = {"task": task, "tasks": tasks, "episodes": episodes, "backend": backend}
-    given = {"max_steps": max_steps, "success": success}
-    decided = chosen.options(suite) | {name: value for name, value in given.items() if value is not None}
-    libero = {
-        "geometry": (geometry, "exact"),
-        "contacts": (contacts, "published"),
-        "fixtures": (fixtures, None),
-        "reset_loop": (reset_loop, None),
-        "start": (start, None),
-        "settle_steps": (settle_steps, None),
-        "num_devices": (num_devices, 1),
-        "budget": (budget, None),
-        "render": (render, None),
-        "scenes": (scenes, None),
-    }
-    simpler = {
-        "gripper": (gripper, "native"),
-        "overlay": (overlay, "background"),
-        "shadows": (shadows, False),
-        "variant": (variant, None),
-        "assets": (assets, None),
-    }
-    if family(suite) == _SIMPLER:
-        own: dict[str, Any] = {**decided, **_own(suite, simpler, libero)}
-        if chosen.name != protocols.DEFAULT:
-            own["protocol"] = chosen.name
-        return _make_simpler(suite, {**common, "num_workers": num_threads, **own})
-    own = {**decided, **({} if seed is None else {"seed": seed}), **_own(suite, libero, simpler)}
-    from vecenv.libero import env
-
-    return env.make(suite, protocol=chosen, **common, num_threads=num_threads, **own)
-
-
-def _own(suite: str, own: Mapping[str, tuple[Any, Any]], foreign: Mapping[str, tuple[Any, Any]]) -> dict[str, Any]:
-    """Those of a family's options that are not at their default; refuses the other family's."""
-    strange = [f"{name}={value!r}" for name, (value, default) in foreign.items() if _given(value, default)]
-    if strange:
-        raise OptionError(f"{suite} has no option {', '.join(strange)}; its own: {', '.join(own)}")
-    return {name: value for name, (value, default) in own.items() if _given(value, default)}
-
-
-def _given(value: Any, default: Any) -> bool:
-    return not (value is default or (type(value) is type(default) and value == default))
-
-
-def _make_simpler(suite: str, options: dict[str, Any]) -> BatchEnv:
-    from vecenv.simpler import tasks
-
-    tasks.list_tasks(suite)  # an unknown suite is said before anything is missed
-    missing = [name for name in _SIMPLER_EXTRA if importlib.util.find_spec(name) is None]
-    if missing:
-        needed = f"{suite} needs {', '.join(missing)}: pip install 'vecenv[simpler]'"
-        raise ExtraMissing(f"{needed} (SAPIEN's wheels are for Python 3.11 and 3.12)", name=missing[0])
-    from vecenv.simpler import env
-
-    return env.make(suite, **options)
+    chosen = registry.family_of(suite)
+    chosen.list_tasks(suite)  # an unknown suite is reported before anything else
+    if task is not None and tasks is not None:
+        raise OptionError("give task or tasks, not both")
+    kind = chosen.config_type()
+    if config is not None and not isinstance(config, kind):
+        raise OptionError(f"{suite}: config is a {type(config).__name__}, expected {kind.__name__}")
+    made = configs.build(kind, fields, config, what=suite, error=OptionError)
+    return chosen.make(suite, tasks if task is None else task, episodes, made)
 
 
 def family(suite: str) -> str:
     """Which benchmark a suite belongs to by its name: ``"simpler"`` for ``simpler/...``, else ``"libero"``."""
-    return _SIMPLER if suite.split("/")[0] == _SIMPLER else "libero"
-
-
-def _simpler_metadata(suite: str, protocol: Protocol) -> dict[str, Any]:
-    """SIMPLER's metadata with the episodes that a protocol has of each task; 0 of those that it leaves out."""
-    from vecenv.simpler import tasks as simpler_tasks
-
-    metadata = simpler_tasks.eval_metadata(suite)
-    if protocol.episodes is not None:
-        return metadata
-    from vecenv.simpler.published import lists as published
-
-    counts = published.counts(protocol.name, suite)
-    per_task = tuple(counts.get(index, 0) for index in range(metadata["num_tasks"]))
-    return {**metadata, "episodes_per_task": per_task, "num_episodes": sum(per_task)}
+    return registry.family_name(suite)
 
 
 def list_suites(family: str | None = None) -> tuple[str, ...]:
@@ -211,18 +108,12 @@ def list_suites(family: str | None = None) -> tuple[str, ...]:
     Raises:
         OptionError: another family.
     """
-    from vecenv.libero.tasks import suites
-    from vecenv.simpler.tasks import SUITES
-
-    known = {"libero": suites.list_suites(), _SIMPLER: SUITES}
-    if family is None:
-        return tuple(name for names in known.values() for name in names)
-    if family not in known:
-        raise OptionError(f"family={family!r}: expected one of {', '.join(known)}, or None for all suites")
-    return known[family]
+    if family is not None:
+        return registry.family(family).list_suites()
+    return tuple(name for each in registry.FAMILIES for name in registry.family(each).list_suites())
 
 
-def list_tasks(suite: str) -> tuple[Any, ...]:
+def list_tasks(suite: str) -> tuple[TaskInfo, ...]:
     """The tasks of a suite in upstream's order, each with an ``index``, a ``name`` and an ``instruction``.
 
     Returns:
@@ -231,13 +122,7 @@ def list_tasks(suite: str) -> tuple[Any, ...]:
     Raises:
         KeyError: a subclass that lists the suites there are.
     """
-    if family(suite) == _SIMPLER:
-        from vecenv.simpler import tasks
-
-        return tasks.list_tasks(suite)
-    from vecenv.libero.tasks import suites
-
-    return suites.list_tasks(suite)
+    return tuple(registry.family_of(suite).list_tasks(suite))
 
 
 def eval_metadata(suite: str, protocol: str = "seed") -> dict[str, Any]:
@@ -251,24 +136,4 @@ def eval_metadata(suite: str, protocol: str = "seed") -> dict[str, Any]:
         KeyError: a subclass that lists the suites there are.
         ProtocolError: suites of this kind have no such protocol.
     """
-    from vecenv import protocols
-
-    chosen = protocols.protocol(protocol, family(suite))
-    if family(suite) == _SIMPLER:
-        return {**_simpler_metadata(suite, chosen), "protocol": chosen.to_dict()}
-    from vecenv.libero.tasks import suites
-
-    tasks = suites.list_tasks(suite)
-    episodes = chosen.episodes or suites.NUM_EPISODES
-    return {
-        "suite": suite,
-        "protocol": chosen.to_dict(),
-        "num_tasks": len(tasks),
-        "episodes_per_task": episodes,
-        "num_episodes": len(tasks) * episodes,
-        "max_steps": chosen.horizon_of(suite),
-        "metrics": ("success", "num_steps", "cumulative_reward"),
-        "action_space": ("step_continuous", "step_ee_pose"),
-        "control_hz": 20,
-        "instructions": tuple(task.instruction for task in tasks),
-    }
+    return registry.family_of(suite).eval_metadata(suite, protocol)

@@ -88,7 +88,7 @@ def continuous(value: Any, num_envs: int, limits: Any = 1.0) -> tuple[np.ndarray
         limits: largest absolute values, one number or [7].
 
     Returns:
-        float64 actions [B, K, 7], finite and within the limits; and which slots had to be mended, bool [B].
+        float64 actions [B, K, 7], finite and within the limits; and which slots had to be sanitized, bool [B].
 
     Raises:
         ActionError: the wrong shape or not numbers.
@@ -103,8 +103,8 @@ def continuous(value: Any, num_envs: int, limits: Any = 1.0) -> tuple[np.ndarray
     if array.ndim != 3 or array.shape[0] != num_envs or array.shape[2] != ACTION_DIM:
         raise ActionError(f"actions: got shape {shape}; expected {right}")
     most = np.asarray(limits, float)
-    mended = np.clip(np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0), -most, most)
-    return mended, (mended != array).any(axis=(1, 2))
+    sanitized = np.clip(np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0), -most, most)
+    return sanitized, (sanitized != array).any(axis=(1, 2))
 
 
 def ee_poses(value: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:

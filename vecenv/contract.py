@@ -16,7 +16,7 @@ Rules that hold for every environment:
   the end of its budget, and the verdict is read there. ``evaluate`` reports both. The reward is 1 at the tick at which
   the goal first holds, else 0.
 * A chunk of K actions stops at a slot's own terminal step; the other slots go on.
-* NaN and infinities in actions become 0 and values are clipped to the action range; ``info["mended"]`` says where.
+* NaN and infinities in actions become 0 and values are clipped to the action range; ``info["sanitized"]`` says where.
 * A slot whose physics fails (non-finite state, exhausted contact memory) is quarantined: ``info["fault"][i]`` names the
   cause, the slot ends truncated and unsuccessful, and no other slot is affected.
 """
@@ -24,13 +24,17 @@ Rules that hold for every environment:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 
 from vecenv.errors import NotFound
+from vecenv.placement import Placement
 
+# Called before a tick: actions [B, 7], and which slots they are for, bool [B].
+Watcher: TypeAlias = Callable[[np.ndarray, np.ndarray], None]
 # When an episode that reaches its goal ends: there, or at the end of its budget.
 FIRST, FINAL = SUCCESS_MODES = ("first", "final")
 # Columns of the 7-vector taken by ``step_continuous``.
@@ -69,7 +73,7 @@ class Control:
         truncated: the budget ran out or the slot was quarantined, bool [B].
         success: verdict of each slot at its last executed tick, bool [B].
         step_index: control ticks executed in the episode so far, int [B].
-        info: diagnostics. Always has ``mended`` (bool [B], an action held NaN, infinities or values out of range),
+        info: diagnostics. Always has ``sanitized`` (bool [B], an action held NaN, infinities or values out of range),
             ``fault`` (tuple of B strings, empty when healthy) and ``ticks`` (int [B], ticks executed in this call);
             SIMPLER's also ``parts`` (what its success is made of, a mapping a slot) and ``stand_ins`` (sentences about
             missing files, a tuple a slot).
@@ -440,7 +444,32 @@ class State:
 class BatchEnv(Protocol):
     """The verbs. ``vecenv.make`` returns one of these whatever the simulator underneath."""
 
+    suite: str
     num_envs: int
+
+    @property
+    def config(self) -> object:
+        """The options it was made with, those that the protocol decided filled in: the family's config."""
+        ...
+
+    @property
+    def control_hz(self) -> float:
+        """Control ticks a second."""
+        ...
+
+    @property
+    def placement(self) -> Placement:
+        """Task and episode of each slot."""
+        ...
+
+    @property
+    def done(self) -> np.ndarray:
+        """Which slots have finished their episode, bool [B]; the others are live, or wait for ``reset``."""
+        ...
+
+    def instructions(self) -> tuple[str, ...]:
+        """What each slot's policy is told at present; some SIMPLER tasks have two instructions in turn."""
+        ...
 
     def reset(self) -> ResetInfo:
         """Make every slot live; live slots are left alone."""
@@ -468,6 +497,18 @@ class BatchEnv(Protocol):
 
     def evaluate(self) -> Metrics:
         """Verdicts."""
+        ...
+
+    def state(self) -> State:
+        """Physics state of every slot, a copy."""
+        ...
+
+    def set_state(self, state: State) -> None:
+        """Overwrite the physics state of every slot; step counts and verdicts stay."""
+        ...
+
+    def watched(self, watcher: Watcher) -> AbstractContextManager[None]:
+        """While inside, ``watcher`` is called before every tick of an episode."""
         ...
 
     def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:

@@ -7,19 +7,16 @@ In: which episode sits in which slot, and from a simulator, ticks, successes and
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from vecenv import actions as action_space
-from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo
+from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo, Watcher
 from vecenv.controllers.waypoint import Plan
 from vecenv.placement import Placement
-
-# Called before a tick: actions [B, 7], and which slots they are for, bool [B].
-Watcher = Callable[[np.ndarray, np.ndarray], None]
 
 _Kind = TypeVar("_Kind", bound=Control)
 
@@ -128,7 +125,7 @@ class SlotBatch(ABC):
             Episode metadata of every slot; no observation.
         """
         self._check_open()
-        stale = ~self._live | self._done
+        stale = ~self._live | self.done
         if stale.any():
             self._arm(stale)
             self._begin(stale)
@@ -264,11 +261,16 @@ class SlotBatch(ABC):
                 self._terminated[slot] = self._success[slot] = self._solved[slot] = False
 
     def _control(
-        self, kind: type[_Kind], reward: np.ndarray, before: np.ndarray, mended: np.ndarray | None = None, **extra: Any
+        self,
+        kind: type[_Kind],
+        reward: np.ndarray,
+        before: np.ndarray,
+        sanitized: np.ndarray | None = None,
+        **extra: Any,
     ) -> _Kind:
-        """What a step returns: ``before`` are the steps that slots had taken, ``mended`` is nowhere unless given."""
+        """What a step returns: ``before`` are the steps that slots had taken, ``sanitized`` is nowhere unless given."""
         info = {
-            "mended": np.zeros(self.num_envs, bool) if mended is None else mended,
+            "sanitized": np.zeros(self.num_envs, bool) if sanitized is None else sanitized,
             "fault": tuple(self._fault),
             "ticks": self._steps - before,
             **self._diagnostics(),
@@ -299,7 +301,8 @@ class SlotBatch(ABC):
         )
 
     @property
-    def _done(self) -> np.ndarray:
+    def done(self) -> np.ndarray:
+        """Which slots have finished their episode, bool [B]."""
         return self._terminated | self._truncated
 
     def _check_open(self) -> None:

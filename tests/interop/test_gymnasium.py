@@ -327,7 +327,7 @@ def test_actions_that_are_no_numbers_are_mended_and_wrong_shapes_refused(envs: V
     envs.reset()
     action = np.zeros((COUNT, 7))
     action[1, 0] = np.nan
-    assert envs.step(action)[-1]["mended"].tolist() == [False, True, False]
+    assert envs.step(action)[-1]["sanitized"].tolist() == [False, True, False]
     with pytest.raises(ActionError):
         envs.step(np.zeros((COUNT, 6)))
 

@@ -165,10 +165,10 @@ class TestStepping:
         actions = np.zeros((3, 7))
         actions[0, 0], actions[1, 1], actions[1, 2] = np.nan, np.inf, -7.0
         control = env.step_continuous(actions)
-        assert control.info["mended"].tolist() == [True, True, False]
+        assert control.info["sanitized"].tolist() == [True, True, False]
         expected = np.zeros((3, 7))
         expected[1, 2] = -1.0
-        assert not clean.step_continuous(expected).info["mended"].any()
+        assert not clean.step_continuous(expected).info["sanitized"].any()
         np.testing.assert_array_equal(env.state().qpos, clean.state().qpos)
 
     @pytest.mark.parametrize("bad", [np.zeros((2, 7)), np.zeros((3, 6)), np.zeros(7), "[[", [[1], [2, 3]], "ab"])

@@ -175,13 +175,13 @@ def test_an_episode_repeats_exactly_whatever_ran_before_or_beside_it(tree: Path,
 def test_bad_numbers_are_mended_and_reported(carrot: SimplerEnv) -> None:
     actions = np.zeros((2, 7))
     actions[1] = [np.nan, np.inf, 0, 0, 0, 2.0, 0]
-    assert carrot.step_continuous(actions).info["mended"].tolist() == [False, True]
+    assert carrot.step_continuous(actions).info["sanitized"].tolist() == [False, True]
 
 
 def test_rotations_up_to_a_quarter_turn_are_not_clipped(carrot: SimplerEnv) -> None:
     actions = np.zeros((2, 7))
     actions[0, 3] = 1.5
-    assert not carrot.step_continuous(actions).info["mended"].any()
+    assert not carrot.step_continuous(actions).info["sanitized"].any()
 
 
 def test_actions_may_be_json(carrot: SimplerEnv) -> None:

@@ -71,7 +71,7 @@ class FakeEnv:
             success=self.terminated.copy(),
             step_index=self.ticks.copy(),
             info={
-                "mended": np.zeros(self.num_envs, bool),
+                "sanitized": np.zeros(self.num_envs, bool),
                 "fault": self._fault_names(),
                 "ticks": self.ticks - before,
             },

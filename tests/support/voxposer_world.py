@@ -122,7 +122,7 @@ class Obedient:
             "truncated": ~solved & (self.ticks >= self._budget),
             "success": solved,
             "step_index": self.ticks.copy(),
-            "info": {"mended": solved, "fault": ("",) * self.num_envs, "ticks": self.ticks.copy()},
+            "info": {"sanitized": solved, "fault": ("",) * self.num_envs, "ticks": self.ticks.copy()},
         }
 
     def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> Any:

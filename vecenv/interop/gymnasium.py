@@ -177,7 +177,7 @@ class _Slots:
         return control, {
             "success": control.success,
             "step_index": control.step_index,
-            "mended": control.info["mended"],
+            "sanitized": control.info["sanitized"],
             "fault": np.array(control.info["fault"], object),
         }
 
@@ -203,8 +203,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, np.ndarray, np.ndarray]):
     metres, wxyz, world frame) of each object and fixture and the joints of the fixtures; see ``layouts``. With scenes
     of different size in a batch, ``objects`` is padded with zeros. Actions are those of ``step_continuous``.
 
-    ``infos`` of a step hold ``success``, ``step_index``, ``mended`` and ``fault`` (as in ``contract.Control``), those
-    of a beginning episode ``episode_id`` and ``instruction``, each with a mask ``_name`` of who it is about; with
+    ``infos`` of a step hold ``success``, ``step_index``, ``sanitized`` and ``fault`` (as in ``contract.Control``),
+    those of a beginning episode ``episode_id`` and ``instruction``, each with a mask ``_name`` of who it is about; with
     ``SAME_STEP`` also ``final_obs`` and ``final_info``.
 
     Args:

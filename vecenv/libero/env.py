@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -31,14 +30,13 @@ from vecenv.contract import (
     State,
 )
 from vecenv.controllers import waypoint
-from vecenv.libero.config import MAX_STEPS as MAX_STEPS
 from vecenv.libero.config import LiberoConfig, LiberoError
 from vecenv.libero.physics import budgets, settling
 from vecenv.libero.physics.base import SETTLE_ACTION, Group, Physics, Start
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.build import make_physics
 from vecenv.libero.render.cameras import Eyes, options_of
-from vecenv.libero.render.options import RenderConfig, VisualOptions
+from vecenv.libero.render.options import VisualOptions
 from vecenv.libero.scene import goals, surface
 from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.libero.scene.parts import PartSpec, opening, scene_parts
@@ -48,7 +46,6 @@ from vecenv.libero.tasks import settled as settled_starts
 from vecenv.libero.tasks.export import exported_tasks
 from vecenv.libero.tasks.sources import Task, installed_tasks
 from vecenv.libero.tasks.suites import NUM_EPISODES
-from vecenv.protocols import DEFAULT, Protocol
 from vecenv.slots import SlotBatch
 
 # Starts of a scene on which its memory on MJX is measured.
@@ -99,11 +96,12 @@ class LiberoEnv(SlotBatch):
     _error = LiberoError
 
     def __init__(self, suite: str, tasks: Sequence[Task], placement: placing.Placement, config: LiberoConfig) -> None:
-        super().__init__(suite, len(placement), success=config.success)
-        self.config = config
+        self._rules = config.rules(suite)
+        super().__init__(suite, len(placement), success=self._rules.success)
+        self.config = replace(config, **vars(self._rules))
         self._sources = tasks
         self._physics: Physics | None = None
-        self._eyes = Eyes(config.render, self.num_envs)
+        self._eyes = Eyes(self._rules.render, self.num_envs)
         self._place(placement)
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
@@ -135,7 +133,7 @@ class LiberoEnv(SlotBatch):
         problems = {int(i): self._sources[i].problem() for i in indices}
         keys = list(dict.fromkeys(problem.scene_key() for problem in problems.values()))
         scenes = [self._scene(key, problems) for key in keys]
-        fixture_poses.check_names(self.config.fixtures, scenes)
+        fixture_poses.check_names(self._rules.fixtures, scenes)
         self._tasks = {
             i: _TaskData(self._sources[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
         }
@@ -152,7 +150,7 @@ class LiberoEnv(SlotBatch):
                 budgets=[self._budget_of(key, scene) for key, scene in zip(keys, scenes, strict=True)],
             )
         self._physics.set_goals([self._goal_table(group) for group in self._physics.groups])
-        return np.full(self.num_envs, self.config.max_steps)
+        return np.full(self.num_envs, self._rules.max_steps)
 
     def _scene(self, key: SceneKey, problems: Mapping[int, Problem]) -> Scene:
         """The scene of this key, for those of the problems that share it."""
@@ -179,7 +177,7 @@ class LiberoEnv(SlotBatch):
             source.problem(),
             scene,
             "center",
-            keys=[(self.config.seed, self.suite, task, int(episode)) for episode in episodes],
+            keys=[(self._rules.seed, self.suite, task, int(episode)) for episode in episodes],
             slots=list(range(len(episodes))),
         )
         return Start(
@@ -210,7 +208,7 @@ class LiberoEnv(SlotBatch):
                 if len(slots):
                     self.physics.place(group, slots, self._start(group.scene, int(task), slots))
         settle = np.tile(SETTLE_ACTION, (self.num_envs, 1))
-        for _ in range(self.config.settle_steps if self.config.start == "raw" else 0):
+        for _ in range(self._rules.settle_steps if self._rules.start == "raw" else 0):
             self.physics.control_step(settle, stale)
 
     def _start(self, scene: Scene, task: int, slots: np.ndarray) -> Start:
@@ -226,12 +224,12 @@ class LiberoEnv(SlotBatch):
         bodies, pos, quat = fixture_poses.poses(
             data.problem,
             scene,
-            self.config.fixtures,
-            keys=[(self.config.seed, self.suite, task, int(episode)) for episode in episodes],
+            self._rules.fixtures,
+            keys=[(self._rules.seed, self.suite, task, int(episode)) for episode in episodes],
             slots=slots.tolist(),
-            loop=self.config.loop,
+            loop=self._rules.reset_loop,
         )
-        settled = self.config.start == "settled" and self.config.fixtures == "center"
+        settled = self._rules.start == "settled" and self._rules.fixtures == "center"
         start = Start(
             qpos=qpos[episodes],
             qvel=qvel[episodes],
@@ -241,7 +239,7 @@ class LiberoEnv(SlotBatch):
             time=settled_starts.TIME if settled else 0.0,
             settled=settled,
         )
-        if settled or self.config.start == "raw":
+        if settled or self._rules.start == "raw":
             return start
         return settling.at_rest(self._settling_scene(data, scene), start)
 
@@ -253,7 +251,7 @@ class LiberoEnv(SlotBatch):
 
     def _stored(self, data: _TaskData) -> tuple[np.ndarray, np.ndarray]:
         """Positions [50, nq] and velocities [50, nv] of a task's starts."""
-        if self.config.start == "settled" and self.config.fixtures == "center":
+        if self._rules.start == "settled" and self._rules.fixtures == "center":
             starts = data.source.settled()
             return starts.qpos, starts.qvel
         states, free_joints = data.source.init_states(), len(data.problem.objects)
@@ -284,11 +282,11 @@ class LiberoEnv(SlotBatch):
             ActionError: not numbers, or another shape.
         """
         self._check_live()
-        chunk, mended = action_space.continuous(actions, self.num_envs)
+        chunk, sanitized = action_space.continuous(actions, self.num_envs)
         before = self._steps.copy()
         until = self._until_success
-        ran = self.physics.run(chunk, ~self._done, self._ticks_left, self._watchers, until_success=until)
-        return self._control(Control, self._book(ran.ticks, ran.success, ran.solved), before, mended)
+        ran = self.physics.run(chunk, ~self.done, self._ticks_left, self._watchers, until_success=until)
+        return self._control(Control, self._book(ran.ticks, ran.success, ran.solved), before, sanitized)
 
     @property
     def _ticks_left(self) -> np.ndarray:
@@ -306,7 +304,7 @@ class LiberoEnv(SlotBatch):
     def _follow(self, plan: waypoint.Plan, max_misses: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         followed = self.physics.follow(
             plan,
-            ~self._done,
+            ~self.done,
             self._ticks_left,
             self.config.waypoint,
             max_misses=max_misses,
@@ -448,6 +446,11 @@ class LiberoEnv(SlotBatch):
         if len(self.mj_models) != 1:
             raise LiberoError(f"this batch has {len(self.mj_models)} scenes; use mj_models and scene_index")
         return self.mj_models[0]
+
+    @property
+    def control_hz(self) -> float:
+        """Control ticks a second."""
+        return 20
 
     def state(self) -> State:
         """Physics state of every slot, a copy."""
@@ -608,34 +611,15 @@ def axis_angle(quat: np.ndarray) -> np.ndarray:
     return quat[..., 1:] * scale
 
 
-def make(
-    suite: str,
-    *,
-    task: Any = None,
-    tasks: Any = None,
-    episodes: Any = None,
-    scenes: str | Path | None = None,
-    protocol: Protocol | None = None,
-    **options: Any,
-) -> LiberoEnv:
-    """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments.
-
-    Args:
-        protocol: says how many episodes there are and how large images are, where that is not given; this project's
-            own when left out.
-    """
-    protocol = protocol or protocols.protocol(DEFAULT)
-    sources = installed_tasks(suite) if scenes is None else exported_tasks(scenes, suite)
-    if task is not None and tasks is not None:
-        raise LiberoError("give task or tasks, not both")
-    names = [source.name for source in sources]
+def make(suite: str, *, tasks: object = None, episodes: object = None, config: LiberoConfig | None = None) -> LiberoEnv:
+    """A batch of LIBERO episodes; ``vecenv.make`` documents the arguments."""
+    config = config or LiberoConfig()
+    sources = installed_tasks(suite) if config.scenes is None else exported_tasks(config.scenes, suite)
     placement = placing.cross(
-        placing.task_indices(tasks if task is None else task, names),
+        placing.task_indices(tasks, [source.name for source in sources]),
         episodes,
         num_tasks=len(sources),
         num_episodes=NUM_EPISODES,
-        every=protocol.episodes,
+        every=protocols.protocol(config.protocol).episodes,
     )
-    if "render" not in options and protocol.image_size is not None:
-        options["render"] = RenderConfig(height=protocol.image_size, width=protocol.image_size)
-    return LiberoEnv(suite, sources, placement, LiberoConfig(protocol=protocol.name, **options))
+    return LiberoEnv(suite, sources, placement, config)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from vecenv.contract import FIRST, SUCCESS_MODES
+from vecenv.contract import SUCCESS_MODES
 from vecenv.errors import InvalidInput
+from vecenv.protocols import SIMPLER
+from vecenv.protocols import protocol as find_protocol
 from vecenv.simpler.control.servo import ServoConfig
 from vecenv.simpler.published.lists import SEED, check_protocol
-from vecenv.simpler.variants import Variant
+from vecenv.simpler.variants import Variant, make_variant
 
 BACKENDS = ("physx_cpu",)
 # What ``vecenv.make`` calls a suite's own CPU physics.
@@ -33,8 +37,8 @@ class SimplerConfig:
 
     Attributes:
         backend: ``"physx_cpu"``, also called ``"native"``; ``"physx_cuda"`` is not supported, and says so.
-        num_workers: processes that scenes are spread over; 1 steps them in this one. None: one a core, and no more
-            than slots.
+        num_threads: worker processes that scenes are spread over; 1 steps them in this process. None: one a core,
+            and no more than slots.
         gripper: ``"native"``, the robot's own convention; or ``"binary"``, 1 closed and 0 open (above or below one
             half).
         max_steps: step budget in control ticks; None for each task's own.
@@ -52,16 +56,16 @@ class SimplerConfig:
     """
 
     backend: str = "physx_cpu"
-    num_workers: int | None = None
+    num_threads: int | None = None
     gripper: str = "native"
     max_steps: int | None = None
-    success: str = FIRST
+    success: str | None = None
     servo: ServoConfig | None = None
     overlay: str = "background"
     shadows: bool = False
-    variant: Variant | None = None
+    variant: Variant | Mapping[str, Any] | None = None
     protocol: str = SEED
-    assets: Path | None = None
+    assets: str | Path | None = None
 
     def __post_init__(self) -> None:
         if self.backend == "physx_cuda":
@@ -74,11 +78,17 @@ class SimplerConfig:
             ("overlay", OVERLAYS),
             ("success", SUCCESS_MODES),
         ):
-            if getattr(self, name) not in allowed:
+            if getattr(self, name) not in (*allowed, *((None,) if name == "success" else ())):
                 raise SimplerError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
+        object.__setattr__(self, "variant", make_variant(self.variant))
         if check_protocol(self.protocol) != SEED and self.variant is not None:
             raise SimplerError(f"variant={self.variant}: protocol {self.protocol!r} says itself what varies")
-        for name in ("num_workers", "max_steps"):
+        for name in ("num_threads", "max_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise SimplerError(f"{name}={value}: need at least 1, or None")
+
+    @property
+    def success_mode(self) -> str:
+        """When an episode ends: as given, or as the protocol says."""
+        return self.success or find_protocol(self.protocol, SIMPLER).success

@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -32,10 +31,10 @@ from vecenv.simpler.episodes import Episode, prepare, require_drawable
 from vecenv.simpler.judge import Judge, Verdict
 from vecenv.simpler.physics.scenes import instances
 from vecenv.simpler.physics.workers import Job, Sizes, Slots, make_slots
-from vecenv.simpler.published.lists import SEED, EpisodeSpec, check_placement, counts, place, scene_of
+from vecenv.simpler.published.lists import EpisodeSpec, check_placement, counts, place, scene_of
 from vecenv.simpler.published.lists import episodes as published_episodes
 from vecenv.simpler.tasks import find_task, list_tasks
-from vecenv.simpler.variants import make_variant, varied
+from vecenv.simpler.variants import varied
 from vecenv.slots import SlotBatch
 
 if TYPE_CHECKING:
@@ -69,8 +68,8 @@ class SimplerEnv(SlotBatch):
     _error = SimplerError
 
     def __init__(self, suite: str, placement: placing.Placement, config: SimplerConfig) -> None:
-        super().__init__(suite, len(placement), success=config.success)
-        self.config = config
+        super().__init__(suite, len(placement), success=config.success_mode)
+        self.config = replace(config, success=config.success_mode)
         self.tasks = list_tasks(suite)
         self.robot = self.tasks[0].robot
         self._root = assets.simpler_root(config.assets)
@@ -88,7 +87,7 @@ class SimplerEnv(SlotBatch):
         return Sizes(slots=self.num_envs, substeps=robot.substeps, dof=robot.dof, objects=_MAX_OBJECTS)
 
     def _num_workers(self) -> int:
-        return self.config.num_workers or len(os.sched_getaffinity(0))
+        return self.config.num_threads or len(os.sched_getaffinity(0))
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
@@ -180,15 +179,15 @@ class SimplerEnv(SlotBatch):
             ActionError: not numbers, or another shape.
         """
         self._check_live()
-        chunk, mended = action_space.continuous(actions, self.num_envs, ACTION_LIMITS)
+        chunk, sanitized = action_space.continuous(actions, self.num_envs, ACTION_LIMITS)
         chunk[..., 6] = self._native_gripper(chunk[..., 6])
         self._servo.forget(np.ones(self.num_envs, bool))
         before, reward = self._steps.copy(), np.zeros(self.num_envs)
         for tick in range(chunk.shape[1]):
-            if self._done.all():
+            if self.done.all():
                 break
-            reward += self._tick(chunk[:, tick], ~self._done)
-        return self._control(Control, reward, before, mended)
+            reward += self._tick(chunk[:, tick], ~self.done)
+        return self._control(Control, reward, before, sanitized)
 
     def _native_gripper(self, values: np.ndarray) -> np.ndarray:
         return values if self.config.gripper == "native" else self._servo.gripper(values)
@@ -226,14 +225,14 @@ class SimplerEnv(SlotBatch):
         servo, driving, reward = self._servo, hold == 0, np.zeros(self.num_envs)
         servo.begin(self._facts["tcp"])
         ticks = np.where(driving, servo.config.max_steps, hold)
-        going, used, arrived = moves & ~self._done, np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
+        going, used, arrived = moves & ~self.done, np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
         while going.any():
             actions = servo.actions(targets, driving & going, self._facts)
             reward += self._tick(actions, going)
             used += going
             arrived = servo.arrived(targets, self._facts["tcp"])
             stuck = servo.stuck(targets, self._facts["tcp"], driving & going)
-            going = going & ~self._done & (used < ticks) & ~(driving & arrived) & ~stuck
+            going = going & ~self.done & (used < ticks) & ~(driving & arrived) & ~stuck
         return reward, arrived
 
     def _follow(self, plan: Plan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -333,6 +332,11 @@ class SimplerEnv(SlotBatch):
     @property
     def _facts(self) -> np.ndarray:
         return self.slots.facts
+
+    @property
+    def control_hz(self) -> float:
+        """Control ticks a second."""
+        return self.robot.control_hz
 
     def state(self) -> State:
         """Physics state of every slot, a copy: positions are the robot's, the drawers', then xyz + wxyz of the objects;
@@ -434,7 +438,7 @@ class _Followed:
         servo, reward = env._servo, np.zeros(env.num_envs)
         servo.begin(env._facts["tcp"])
         self._skip()
-        while (going := (self._at < length) & ~env._done & self._patient()).any():
+        while (going := (self._at < length) & ~env.done & self._patient()).any():
             here = np.minimum(self._at, length - 1)
             targets, driving = self._targets[self._rows, here], self._hold[self._rows, here] == 0
             reward += env._tick(servo.actions(targets, driving & going, env._facts), going)
@@ -477,18 +481,14 @@ def task_indices(suite: str, tasks: Any) -> Any:
     return tasks
 
 
-def make(suite: str, *, task: Any = None, tasks: Any = None, episodes: Any = None, **options: Any) -> SimplerEnv:
+def make(
+    suite: str, *, tasks: object = None, episodes: object = None, config: SimplerConfig | None = None
+) -> SimplerEnv:
     """A batch of SIMPLER episodes; ``vecenv.make`` documents the arguments.
 
     Raises:
         UnknownSuite, UnknownTask, PlacementError, PublishedError, SimplerError, AssetsMissing: something that does not
             exist.
     """
-    if task is not None and tasks is not None:
-        raise SimplerError("give task or tasks, not both")
-    chosen = task_indices(suite, tasks if task is None else task)
-    placement = place(options.get("protocol", SEED), suite, chosen, episodes)
-    tree = options.pop("assets", None)
-    chosen_variant = make_variant(options.pop("variant", None))
-    config = SimplerConfig(assets=Path(tree) if tree else None, variant=chosen_variant, **options)
-    return SimplerEnv(suite, placement, config)
+    config = config or SimplerConfig()
+    return SimplerEnv(suite, place(config.protocol, suite, task_indices(suite, tasks), episodes), config)
