@@ -2,13 +2,15 @@
 
 For each settled start: every ``:init`` predicate of the BDDL about objects and joints holds, the goal is not yet true,
 and nothing has moved by more than 5 mm after 50 further idle ticks. A row is a suite on a backend, with the number of
-starts that miss each premise; the file lists them by task, predicate or object, and episode. With ``--start stored``
-the predicates are asked of the init states exactly as LIBERO stores them, which says what it missed from the beginning.
+starts that miss each premise; all but the predicates, of which there are thousands, are listed by task and episode.
+``--details FILE`` lists these as well, and ``--summarise FILE`` makes the results file of such a list. With ``--start
+stored`` the predicates are asked of the init states exactly as LIBERO stores them, which says what it missed from the
+beginning.
 
 Two stages: ``--observe`` runs the backend, scene by scene in worker processes, and writes a file a scene with what it
 saw; with ``--scenes`` it needs no LIBERO packages, so it can be done on a GPU machine. ``--judge`` asks the predicates
-of these files, on native physics, and needs the packages. Without either, both are done in turn. Rows of other backends
-that the results file holds are kept.
+of these files, on native physics, and needs the packages. Without either, both are done in turn. Rows of other suites
+and backends that the results file holds are kept; a suite that is judged again, be it in part, gets a new one.
 
     python benchmarks/premises.py                                        # native physics
     vecenv compile --out scenes --suite libero_object ... --geometry exact --geometry lean
@@ -48,6 +50,7 @@ IDLE_TICKS = 50
 MOVED = 0.005
 # Metres by which a state of single precision may miss a touch: a bowl rests 4e-8 m deep, and 1 m is rounded by 6e-8.
 ROUNDING = {"native": 0.0, "warp": 1e-6, "jax": 1e-6}
+NOTE = "exceptions of predicates are left out; --details lists them"
 
 
 # -- observing ---------------------------------------------------------------------------------------------------------
@@ -201,9 +204,8 @@ def init_predicates(suite: str, task: int, seen: Mapping[str, np.ndarray], margi
 
 def summarise(exceptions: Mapping[str, Any], checked: Mapping[str, int]) -> list[dict[str, Any]]:
     """A row a suite and backend: how many starts miss each premise."""
-    rows, suites = [], vecenv.list_suites("libero")
-    sides = {tuple(key.split("/")[:2]) for key in checked}
-    for side, suite in sorted(sides, key=lambda pair: (pair[0], suites.index(pair[1]))):
+    rows = []
+    for side, suite in sorted({tuple(key.split("/")[:2]) for key in checked}):
         specs = vecenv.list_tasks(suite)
         missed: dict[str, set[tuple[int, int]]] = defaultdict(set)
         counts = {key: number for key, number in checked.items() if key.startswith(f"{side}/{suite}/")}
@@ -226,7 +228,13 @@ def summarise(exceptions: Mapping[str, Any], checked: Mapping[str, int]) -> list
                 "fault": len(missed["fault"]),
             }
         )
-    return rows
+    return in_order(rows)
+
+
+def in_order(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows by backend, then in the order of the suites."""
+    suites = vecenv.list_suites("libero")
+    return sorted(rows, key=lambda row: (row["backend"], suites.index(row["suite"])))
 
 
 def on_workspace(predicate: str, problem: Problem) -> bool:
@@ -235,18 +243,28 @@ def on_workspace(predicate: str, problem: Problem) -> bool:
     return words[0] == "on" and len(words) == 3 and ARENAS[problem.name].workspace in words[2]
 
 
-def known(name: str) -> tuple[dict[str, Any], dict[str, int]]:
-    """Exceptions and numbers of starts by task that a results file has; none where there is no file."""
-    path = RESULTS / f"{name}.json"
+def brief(exceptions: Mapping[str, Any]) -> dict[str, Any]:
+    """Exceptions without the predicates."""
+    without = {key: {k: what for k, what in missed.items() if k != "init"} for key, missed in exceptions.items()}
+    return {key: missed for key, missed in without.items() if missed}
+
+
+def kept(name: str, checked: Mapping[str, int]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Rows and exceptions that a results file has of suites on backends other than those that were checked."""
+    path, anew = RESULTS / f"{name}.json", {tuple(key.split("/")[:2]) for key in checked}
     content = json.loads(path.read_text()) if path.is_file() else {"exceptions": {}, "rows": []}
-    checked = content.get("checked")
-    if checked is None:  # as written before there were other backends: whole suites
-        checked = {
-            f"{row['backend']}/{row['suite']}/{spec.index}": NUM_EPISODES
-            for row in content["rows"]
-            for spec in vecenv.list_tasks(row["suite"])
-        }
-    return content["exceptions"], checked
+    rows = [row for row in content["rows"] if (row["backend"], row["suite"]) not in anew]
+    return rows, {key: what for key, what in content["exceptions"].items() if tuple(key.split("/")[:2]) not in anew}
+
+
+def resummarise(details: Path) -> None:
+    """Write the results file of a list that ``--details`` wrote, with that run's date, machine and versions."""
+    content = json.loads(details.read_text())
+    exceptions, checked, _ = (content.pop(name) for name in ("exceptions", "checked", "rows"))
+    rows, others = kept(content["benchmark"], checked)
+    content |= {"note": NOTE, "exceptions": {**others, **brief(exceptions)}}
+    content["rows"] = in_order([*rows, *summarise(exceptions, checked)])
+    (RESULTS / f"{content['benchmark']}.json").write_text(json.dumps(content, indent=1) + "\n")
 
 
 def jobs_of(options: argparse.Namespace) -> list[Job]:
@@ -266,25 +284,33 @@ def jobs_of(options: argparse.Namespace) -> list[Job]:
 
 
 def main() -> None:
-    """Observe and judge what is asked for; or count again what the results file has."""
+    """Observe and judge what is asked for."""
     options = arguments()
+    if options.summarise:
+        resummarise(options.summarise)
+        return
     name = f"premises_{options.start}"
+    exceptions: dict[str, Any] = {}
+    checked: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as passing:
         folder = options.observe or options.judge or Path(passing)
-        if not options.judge and not options.recount:
+        if not options.judge:
             observe_all(jobs_of(options), folder, options)
         if options.observe:
             print(f"files in {options.observe}; now --judge {options.observe} where LIBERO's packages are installed")
             return
-        exceptions, checked = known(name)
-        for path in sorted(folder.glob(f"*_{options.start}_*.npz")) if not options.recount else ():
+        for path in sorted(folder.glob(f"*_{options.start}_*.npz")):
             for key, starts, missed in judge(path):
-                exceptions.pop(key, None)
                 checked[key] = starts
                 if missed:
                     exceptions[key] = missed
-    notes = {"exceptions": exceptions, "checked": checked}
-    report(name, summarise(exceptions, checked), title=f"starts ({options.start}) that miss a premise", notes=notes)
+    rows, others = kept(name, checked)
+    rows = in_order([*rows, *summarise(exceptions, checked)])
+    notes = {"note": NOTE, "exceptions": {**others, **brief(exceptions)}}
+    path = report(name, rows, title=f"starts ({options.start}) that miss a premise", notes=notes)
+    if options.details:
+        content = json.loads(path.read_text()) | {"exceptions": exceptions, "checked": checked}
+        options.details.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def arguments() -> argparse.Namespace:
@@ -302,7 +328,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--gpus", type=int, default=1, help="GPUs that the workers spread over")
     parser.add_argument("--job-seconds", type=float, default=1200.0, help="give a scene up after this long")
-    parser.add_argument("--recount", action="store_true", help="only count again what the results file has")
+    parser.add_argument("--details", type=Path, metavar="FILE", help="also list every exception, predicates too")
+    parser.add_argument("--summarise", type=Path, metavar="FILE", help="only: the results file of what --details wrote")
     options = parser.parse_args()
     options.suites = options.suites or list(vecenv.list_suites("libero"))
     return options

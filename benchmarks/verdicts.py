@@ -4,23 +4,26 @@ States of a task: settled and stored starts; random rollouts; `pick_place` rollo
 and, mostly, success; and states placed at and across each border of the goal (sides of regions, first contact, support
 radius, joint thresholds). Both sides get the same positions and fixture poses; ours judges with `goals.evaluate`,
 upstream with `check_success`, under MuJoCo 3.3.0 for published contacts (`make upstream`) and under the installed one
-for current contacts. A row is a suite.
+for current contacts. A row is a suite; rows of other suites that the results file holds are kept if they were made with
+the same versions.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections import Counter
 from typing import Any
 
 import numpy as np
 import peer
-from common import report
+from common import RESULTS, report
 from rich.progress import track
 from vecenv_eval.policies import make_policy
 
 import vecenv
 from vecenv.contract import BatchEnv
+from vecenv.doctor import versions
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.contacts import Contacts
@@ -89,6 +92,15 @@ def compare(spec: TaskSpec, contacts: Contacts, python: str) -> tuple[Counter[st
     return Counter({kind: len(group) for kind, group in states.items()}), int((ours & ~differ).sum()), int(differ.sum())
 
 
+def kept(name: str, suites: list[str]) -> list[dict[str, Any]]:
+    """Rows of a results file about suites other than these; none where other versions made them."""
+    path = RESULTS / f"{name}.json"
+    content = json.loads(path.read_text()) if path.is_file() else {}
+    if content.get("versions") != versions():
+        return []
+    return [row for row in content["rows"] if row["suite"] not in suites]
+
+
 def main() -> None:
     """Compare every task of the suites asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -114,8 +126,11 @@ def main() -> None:
             }
         )
         print(rows[-1], flush=True)
+    name = "verdicts" if options.contacts == "published" else "verdicts_current"
+    order = list(BASE_SUITES)
+    rows = sorted(kept(name, options.suites) + rows, key=lambda row: order.index(row["suite"]))
     report(
-        "verdicts" if options.contacts == "published" else "verdicts_current",
+        name,
         rows,
         title=f"states judged by both sides, {options.contacts} contacts",
         notes={

@@ -113,7 +113,9 @@ def compile_command(
     suite: list[str] = typer.Option(
         [], "--suite", help="A LIBERO suite to export; may be given again. All by default."
     ),
-    geometry: list[str] = typer.Option(["exact"], "--geometry", help="exact or lean; may be given again."),
+    geometry: list[str] = typer.Option(
+        ["exact"], "--geometry", help="exact, or lean, which brings exact with it; may be given again."
+    ),
     contacts: str = typer.Option("published", "--contacts", help="published or current."),
 ) -> None:
     """Export LIBERO suites into one folder that needs no LIBERO or robosuite files: tasks, starts, compiled scenes."""

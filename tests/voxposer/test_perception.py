@@ -75,6 +75,19 @@ def test_a_handle_is_in_front_of_its_drawer_and_smaller(kitchen: LiberoEnv) -> N
     assert np.ptp(bar.cloud.points, axis=0).max() < 0.5 * np.ptp(drawer.cloud.points, axis=0).max()
 
 
+def test_parts_are_the_same_with_lean_geometry(kitchen: LiberoEnv) -> None:
+    lean = vecenv.make("libero_goal", task=0, episodes=[0], geometry="lean")
+    assert isinstance(lean, LiberoEnv)
+    lean.reset()
+    lean.set_state(kitchen.state())
+    wanted, found = look(kitchen).parts, look(lean).parts
+    lean.close()
+    assert list(found) == list(wanted)
+    for name, part in found.items():
+        np.testing.assert_array_equal(part.cloud.points, wanted[name].cloud.points)
+        np.testing.assert_array_equal(part.cloud.normals, wanted[name].cloud.normals)
+
+
 def test_what_is_not_there_is_named_with_what_is_like_it(kitchen: LiberoEnv) -> None:
     with pytest.raises(PerceptionError, match="akita_black_bowl_1"):
         see(look(kitchen)).detect("akita_black_bowl_2")

@@ -132,7 +132,7 @@ class LiberoEnv(SlotBatch):
         indices = np.unique(self._placement.task)
         problems = {int(i): self._sources[i].problem() for i in indices}
         keys = list(dict.fromkeys(problem.scene_key() for problem in problems.values()))
-        scenes = [self._scene(key, problems) for key in keys]
+        scenes = [self._scene(key, problems, self.config.geometry) for key in keys]
         fixture_poses.check_names(self._rules.fixtures, scenes)
         self._tasks = {
             i: _TaskData(self._sources[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
@@ -152,14 +152,22 @@ class LiberoEnv(SlotBatch):
         self._physics.set_goals([self._goal_table(group) for group in self._physics.groups])
         return np.full(self.num_envs, self._rules.max_steps)
 
-    def _scene(self, key: SceneKey, problems: Mapping[int, Problem]) -> Scene:
+    def _scene(self, key: SceneKey, problems: Mapping[int, Problem], geometry: str) -> Scene:
         """The scene of this key, for those of the problems that share it."""
         sharing = {i: problem for i, problem in problems.items() if problem.scene_key() == key}
         lean_for = None
-        if self.config.geometry == "lean":
+        if geometry == "lean":
             everywhere = (task.problem() for task in self._sources)
             lean_for = tuple(problem for problem in everywhere if problem.scene_key() == key)
         return self._sources[min(sharing)].scene(goals.contact_pairs(sharing.values()), lean_for, self.config.contacts)
+
+    def _exact_scene(self, group: Group) -> Scene:
+        """A group's scene with upstream's collision geoms, whatever its physics has."""
+        if self.config.geometry == "exact":
+            return group.scene
+        problems = {i: task.problem for i, task in self._tasks.items()}
+        key = problems[int(self._placement.task[group.slots[0]])].scene_key()
+        return self._scene(key, problems, "exact")
 
     def _budget_of(self, scene_key: SceneKey, scene: Scene) -> Budget | None:
         """Memory on MJX: as configured, or measured on the starts of all the suite's tasks in the scene."""
@@ -354,12 +362,15 @@ class LiberoEnv(SlotBatch):
     def observe_objects(self, points: str = "surface") -> Objects:
         """Ground truth of every slot.
 
+        Parts are those of upstream's collision geometry with lean geometry, too.
+
         Args:
             points: ``"surface"``, true surface points of the collision geometry (at least 200 a thing, always the same
                 ones); or ``"aabb"``, points on the faces of the box around it.
 
         Raises:
             LiberoError: another value.
+            ExportError: lean scenes come from a folder that has no exact ones.
         """
         self._check_live()
         if points not in ("surface", "aabb"):
@@ -368,7 +379,7 @@ class LiberoEnv(SlotBatch):
         errors = list(self._fault)
         for group in self.physics.groups:
             group.refresh_kinematics()
-            samples = _Clouds.of(group.scene)
+            samples = _Clouds.of(group.scene, self._exact_scene(group))
             clouds, parts = samples.world(group, points), samples.parts_in_world(group)
             for row, slot in enumerate(group.slots):
                 if not errors[slot]:
@@ -512,16 +523,17 @@ class _Clouds:
 
     @staticmethod
     @functools.lru_cache(maxsize=64)
-    def _cached(scene_id: int, scene: _ByIdentity) -> _Clouds:
+    def _cached(scene_id: int, scene: _ByIdentity, exact: _ByIdentity) -> _Clouds:
         names = tuple(scene.value.entities)
         points = {name: surface.entity_points(scene.value, name) for name in names}
         points[_SCENERY] = surface.scenery_points(scene.value)
         corners = {name: surface.entity_corners(scene.value, name) for name in names}
-        return _Clouds(points, corners, scene_parts(scene.value))
+        return _Clouds(points, corners, scene_parts(exact.value))
 
     @staticmethod
-    def of(scene: Scene) -> _Clouds:
-        return _Clouds._cached(id(scene), _ByIdentity(scene))
+    def of(scene: Scene, exact: Scene) -> _Clouds:
+        """Samples of a scene's geoms, and parts measured on the same scene with upstream's."""
+        return _Clouds._cached(id(scene), _ByIdentity(scene), _ByIdentity(exact))
 
     def world(self, group: Group, points: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         clouds = {name: cloud.world(group.xpos, group.xmat) for name, cloud in self.surface.items()}

@@ -20,7 +20,7 @@ from support.paths import DATA
 
 import vecenv
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv
-from vecenv.libero.physics.colliders import boxbox_jax
+from vecenv.libero.physics.colliders import boxbox_jax, planemesh_jax
 from vecenv.libero.physics.colliders.boxbox import MOST, box_box
 from vecenv.libero.physics.mjx import contacts as mjx_contacts
 from vecenv.libero.physics.mjx.backend import jit
@@ -269,8 +269,9 @@ def test_marked_models_get_native_contacts_and_others_in_the_process_their_own(i
     assert not int(current.opt.disableflags) & mjx_contacts.PUBLISHED
 
 
-def test_meshes_lie_on_planes_with_native_points_on_warp() -> None:
-    model, touching = compiled_stack("warp", "published")
+@pytest.mark.parametrize("impl", ["warp", "jax"])
+def test_meshes_lie_on_planes_with_native_points(impl: str) -> None:
+    model, touching = compiled_stack(impl, "published")
     with np.load(DATA / "plane_mesh_contacts_mujoco_3_3_0.npz", allow_pickle=False) as file:
         poses = file["poses"][:60]
     counts = set()
@@ -281,6 +282,40 @@ def test_meshes_lie_on_planes_with_native_points_on_warp() -> None:
         np.testing.assert_allclose(ours, rows, atol=2e-6)
         counts.add(len(rows))
     assert counts >= {1, 2, 3}
+
+
+def slab() -> tuple[planemesh_jax.Hull, float]:
+    """The mesh of the stack, and its bounding radius."""
+    model = stack("published")
+    hull = planemesh_jax.hull_of(model, 0)
+    assert hull is not None
+    return hull, float(model.geom_rbound[-1])
+
+
+def test_a_mesh_that_lies_flat_has_the_points_of_mujoco() -> None:
+    """Several vertices are equally low: which is the first depends on the way along the edges."""
+    model, touching = compiled_stack("jax", "published")
+    for turn in range(8):
+        quat = [np.cos(turn * np.pi / 8), 0, 0, np.sin(turn * np.pi / 8)] if turn < 4 else np.eye(4)[turn - 4]
+        qpos = np.array([*model.qpos0[:7], 1, 0, 0.005, *quat])
+        rows = between(model, of_mujoco(model, qpos), "MESH")
+        assert len(rows)
+        np.testing.assert_allclose(between(model, touching(qpos), "MESH"), rows, atol=2e-6)
+
+
+def test_derivatives_of_a_mesh_on_a_plane_are_those_of_its_points() -> None:
+    hull, radius = slab()
+    turn = jnp.asarray(rotation(np.array([1, 0.01, 0.02, 0.3])), jnp.float32)
+
+    def contacts_of(height: jax.Array) -> tuple[jax.Array, jax.Array]:
+        above = jnp.array([0.0, 0, 1])
+        return planemesh_jax.plane_mesh(hull, above, jnp.zeros(3), above * height, turn, radius)
+
+    dist, _ = contacts_of(jnp.array(0.0))
+    for derivative in (jax.jacfwd, jax.jacrev):
+        of_dist, of_pos = jit(derivative(contacts_of))(jnp.array(0.0))
+        np.testing.assert_allclose(of_dist, dist < planemesh_jax.NOTHING, atol=1e-6)
+        np.testing.assert_allclose(of_pos[:, 2][dist < 0], 0.5, atol=1e-6)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -224,6 +224,15 @@ def test_a_suite_that_was_not_exported_names_those_that_were(exported: Path) -> 
         make(exported, "libero_90")
 
 
+def test_lean_scenes_come_with_the_exact_ones_that_parts_are_measured_on(tmp_path: Path) -> None:
+    export(tmp_path, ["libero_goal"], geometries=["lean"])
+    env = make(tmp_path, geometry="lean")
+    env.reset()
+    (seen,) = env.observe_objects().snapshot
+    assert seen is not None
+    assert "wooden_cabinet_1_top_handle" in seen.parts
+
+
 # -- the command -------------------------------------------------------------------------------------------------------
 
 

@@ -1,8 +1,8 @@
 """Parts of a scene's things: drawers and handles, doors, knobs, tops and insides, from geoms, joints and regions.
 
-In: a :class:`~vecenv.libero.scene.scene.Scene`. Out: name -> :class:`PartSpec`, samples in body frames and which joint
-moves the part. Names follow one rule, ``<thing>_<which>_<what>``, so that a reader finds "the top drawer of the
-cabinet" by its words:
+In: a :class:`~vecenv.libero.scene.scene.Scene` with upstream's geometry. Out: name -> :class:`PartSpec`, samples in body
+frames and which joint moves the part. Names follow one rule, ``<thing>_<which>_<what>``, so that a reader finds "the
+top drawer of the cabinet" by its words:
 
 * ``<thing>_<level>_drawer``: what a slide joint moves, its handle left out; ``<thing>_<level>_handle``: what sticks out
   in front of it. ``<thing>_door`` and ``<thing>_handle``: likewise for a hinge off to one side of what it carries.
@@ -59,7 +59,12 @@ class PartSpec:
 
 
 def scene_parts(scene: Scene) -> dict[str, PartSpec]:
-    """Every part of a scene by name; the module says how they are named."""
+    """Every part of a scene by name; the module says how they are named.
+
+    Args:
+        scene: with upstream's collision geoms. A lean scene has the same bodies, so these are its parts as well; its
+            own geoms do not tell a drawer from its handle, and some drawers have none.
+    """
     parts: dict[str, PartSpec] = {}
     for entity in scene.entities.values():
         parts.update(_moving_parts(scene, entity))

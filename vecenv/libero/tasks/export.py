@@ -74,7 +74,8 @@ def export(
     Args:
         out: the folder, created if need be.
         suites: which; all of them by default.
-        geometries: profiles of the collision geoms, see ``vecenv.libero.scene.lean.geometry``.
+        geometries: profiles of the collision geoms, see ``vecenv.libero.scene.lean.geometry``. ``"lean"`` brings ``"exact"`` with
+            it: parts of lean scenes are measured on the exact ones.
         contacts: those of the exported scenes, see ``vecenv.libero.scene.contacts``.
         track: called with a list of what is to be done and a word for it, returns it to iterate over: where a progress
             bar goes.
@@ -94,7 +95,8 @@ def export(
     for problem, suite in ((spec.problem(), spec.suite) for specs in tasks.values() for spec in specs):
         sharing.setdefault(problem.scene_key(), []).append(problem)
         in_suite.setdefault((suite, problem.scene_key()), []).append(problem)
-    wanted = [(suite, key, profile) for suite, key in in_suite for profile in dict.fromkeys(geometries)]
+    profiles = dict.fromkeys(["exact", *geometries] if "lean" in geometries else geometries)
+    wanted = [(suite, key, profile) for suite, key in in_suite for profile in profiles]
     ids = {
         (suite, key, profile): _write_scene(
             folder, sharing[key], in_suite[suite, key] if profile == "lean" else None, contacts
@@ -225,9 +227,10 @@ class ExportedTask:
         """
         profile = "exact" if lean_for is None else "lean"
         if profile not in self.scene_ids:
+            every = " ".join(f"--geometry {name}" for name in (*self.scene_ids, profile))
             raise ExportError(
                 f"{self.folder.path}: holds no {profile} scenes of {self.suite}; "
-                f"run `vecenv compile --out {self.folder.path} --geometry {profile}` again"
+                f"run `vecenv compile --out {self.folder.path} {every}` again"
             )
         if contacts != self.folder.contacts:
             raise ExportError(

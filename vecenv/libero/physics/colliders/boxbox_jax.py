@@ -60,14 +60,14 @@ def collider(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Arra
     first, second = (Box(data.geom_xpos[g], data.geom_xmat[g], model.geom_size[g]) for g in geom.T)
     margin = model.geom_margin[geom].sum(-1)
     dist, pos, normal = jax.vmap(box_box)(first, second, margin)
-    frame = jnp.repeat(jax.vmap(_frame)(normal), MOST, axis=0)
+    frame = jnp.repeat(jax.vmap(contact_frame)(normal), MOST, axis=0)
     return dist.reshape(-1), pos.reshape(-1, 3), frame
 
 
 collider.ncon = MOST  # type: ignore[attr-defined]
 
 
-def _frame(normal: jax.Array) -> jax.Array:
+def contact_frame(normal: jax.Array) -> jax.Array:
     """Rows: a unit normal and two tangents, as MuJoCo chooses them, [3, 3]."""
     upright = jnp.abs(normal[1]) < 0.5
     helper = jnp.where(upright, jnp.array([0.0, 1, 0]), jnp.array([0.0, 0, 1]))

@@ -223,8 +223,6 @@ def build(
     model.opt.iterations, model.opt.ls_iterations = iterations or usual_iterations(chosen, "exact")
     # Single precision never gets as close as published contacts ask of native physics.
     model.opt.tolerance, model.opt.ls_tolerance = (contacts.OPTIONS["current"][name] for name in _TOLERANCES)
-    # The margin that native MuJoCo needs for published contacts of meshes; pure JAX knows no margins of meshes.
-    model.geom_margin[model.geom_margin == contacts.MESH_MARGIN] = 0
     touching = _without_contact_sensors(model) if chosen == "jax" else None
     put = mjx_contacts.put_model(model, impl=chosen)
     if chosen == "warp":

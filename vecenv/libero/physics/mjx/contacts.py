@@ -2,9 +2,9 @@
 
 MJX finds the collider of two geoms in a table, as MuJoCo does. This is the one place of vecenv that reaches into MJX's
 private modules. It leaves the tables and functions it finds there as they are: for marked models it runs copies of the
-functions that read a table of ours (``boxbox_warp``, ``planemesh_warp``, ``boxbox_jax``), and unmarked ones go where
-they always went. What is a mark is decided by ``vecenv.libero.scene.contacts``; a model of MuJoCo Warp has no custom
-numbers, there it is a bit of the disable flags that MuJoCo does not use.
+functions that read a table of ours (``boxbox_warp``, ``planemesh_warp``, ``boxbox_jax``, ``planemesh_jax``), and
+unmarked ones go where they always went. What is a mark is decided by ``vecenv.libero.scene.contacts``; a model of MuJoCo Warp
+has no custom numbers, there it is a bit of the disable flags that MuJoCo does not use.
 
 A MuJoCo that arranges these functions in another way is refused with ``MjxContactsError``, which says so.
 """
@@ -25,7 +25,7 @@ from mujoco import mjx
 from mujoco.mjx._src import collision_driver as jax_driver
 
 from vecenv.errors import SimulationError
-from vecenv.libero.physics.colliders import boxbox_jax
+from vecenv.libero.physics.colliders import boxbox_jax, planemesh_jax
 from vecenv.libero.scene.contacts import MARK, MESH_MARGIN
 
 # The bit of a Warp model's disable flags that asks for published contacts.
@@ -193,11 +193,13 @@ def install_jax() -> None:
 
 def _jax_functions() -> dict[str, Callable[..., Any]]:
     """MJX's functions that read its table of colliders, reading one with ours in it."""
-    table, boxes = dict(getattr(jax_driver, "_COLLISION_FUNC", {})), (mjx.GeomType.BOX, mjx.GeomType.BOX)
-    _expect(table.get(boxes), "m d key geom")
-    if not hasattr(table[boxes], "ncon"):
-        raise _unknown("its collision functions have no number of contacts")
-    table[boxes] = boxbox_jax.collider
+    table, kind = dict(getattr(jax_driver, "_COLLISION_FUNC", {})), mjx.GeomType
+    boxes, meshes = (kind.BOX, kind.BOX), (kind.PLANE, kind.MESH)
+    for kinds in (boxes, meshes):
+        _expect(table.get(kinds), "m d key geom")
+        if not hasattr(table[kinds], "ncon"):
+            raise _unknown("its collision functions have no number of contacts")
+    table |= {boxes: boxbox_jax.collider, meshes: planemesh_jax.collider(table[meshes])}
     found = {}
     for name, arguments in (("collision", "m d"), ("make_condim", "m impl")):
         plain = _expect(getattr(jax_driver, name, None), arguments, "_COLLISION_FUNC")
