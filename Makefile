@@ -64,11 +64,13 @@ settled: upstream ## Settle all starts again under MuJoCo 3.3.0, in the venv of 
 	$(VENV)-upstream/bin/python scripts/settle_starts.py
 	$(VENV)-upstream/bin/python scripts/settle_starts.py --check 12
 
-lint: $(VENV)/.installed-dev ## Check style, formatting and types: ruff, pyright
+lint: $(VENV)/.installed-dev ## Check style, formatting, imports and types: ruff, import-linter, pyright
 	@echo "==> ruff check"
 	@$(RUN)/ruff check
 	@echo "==> ruff format --check"
 	@$(RUN)/ruff format --check
+	@echo "==> lint-imports"
+	@$(RUN)/lint-imports --no-cache >$(VENV)/imports.txt || { cat $(VENV)/imports.txt; exit 1; }
 	@echo "==> pyright"
 	@$(RUN)/pyright
 

@@ -1,4 +1,4 @@
-"""The ``vecenv`` command: ``doctor``, ``list`` and ``compile`` live here, other packages mount theirs.
+"""The ``vecenv`` command: ``doctor`` and ``list`` live here, other packages mount theirs.
 
 Arguments come in, text and an exit status go out: 0 done, 1 something is wrong with the machine or the run, 2 the
 arguments were wrong. Commands of other packages are found through the entry-point group ``vecenv.commands``, so this
@@ -8,12 +8,10 @@ package needs no import of theirs. Nothing heavy is imported before a command ru
 from __future__ import annotations
 
 import difflib
-import functools
 import importlib
 import importlib.metadata
 import json
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
@@ -45,7 +43,6 @@ def build_app(plugins: Iterable[importlib.metadata.EntryPoint] | None = None) ->
     app.callback()(_root)
     app.command("doctor")(doctor_command)
     app.command("list")(list_command)
-    app.command("compile")(compile_command)
     for plugin in importlib.metadata.entry_points(group=COMMAND_GROUP) if plugins is None else plugins:
         _mount(app, plugin)
     return app
@@ -106,54 +103,6 @@ def _list_protocols(suite: str, as_json: bool) -> None:
         typer.echo(json.dumps([each.to_dict() for each in chosen], indent=2))
     else:
         _print_protocols(chosen)
-
-
-def compile_command(
-    out: Path = typer.Option(..., "--out", metavar="DIR", help="Folder to write; make(..., scenes=DIR) reads it."),
-    suite: list[str] = typer.Option(
-        [], "--suite", help="A LIBERO suite to export; may be given again. All by default."
-    ),
-    geometry: list[str] = typer.Option(
-        ["exact"], "--geometry", help="exact, or lean, which brings exact with it; may be given again."
-    ),
-    contacts: str = typer.Option("published", "--contacts", help="published or current."),
-) -> None:
-    """Export LIBERO suites into one folder that needs no LIBERO or robosuite files: tasks, starts, compiled scenes."""
-    from rich.console import Console
-    from rich.progress import track
-
-    import vecenv
-    from vecenv.libero.scene.bddl import BDDLError
-    from vecenv.libero.scene.contacts import CONTACTS
-    from vecenv.libero.scene.lean.geometry import PROFILES
-    from vecenv.libero.scene.scene import SceneError
-    from vecenv.libero.tasks.export import ExportError, export
-    from vecenv.libero.tasks.settled import SettledStartsError
-    from vecenv.libero.tasks.suites import TaskDataError
-
-    for name in suite:
-        if name not in vecenv.list_suites("libero"):
-            fail(unknown("suite", name, vecenv.list_suites("libero")))
-    for name in geometry:
-        if name not in PROFILES:
-            fail(unknown("geometry", name, PROFILES))
-    if contacts not in CONTACTS:
-        fail(unknown("contacts", contacts, CONTACTS))
-    console = Console(stderr=True)
-    try:
-        done = export(
-            out,
-            suite or None,
-            geometries=geometry,
-            contacts=contacts,  # type: ignore[arg-type]  # checked there
-            track=functools.partial(track, console=console, disable=not console.is_terminal),
-        )
-    except ExportError as error:
-        fail(str(error))
-    except (BDDLError, SceneError, SettledStartsError, TaskDataError, OSError) as error:
-        fail(str(error), code=1)
-    counts = f"suites: {done.suites}, tasks: {done.tasks}, scenes: {done.scenes}"
-    typer.echo(f"{counts}, {done.size / 1e6:.0f} MB in {done.folder}")
 
 
 def unknown(what: str, given: str, known: Sequence[str]) -> str:

@@ -1,8 +1,8 @@
 """Parts of a scene's things: drawers and handles, doors, knobs, tops and insides, from geoms, joints and regions.
 
-In: a :class:`~vecenv.libero.scene.scene.Scene` with upstream's geometry. Out: name -> :class:`PartSpec`, samples in body
-frames and which joint moves the part. Names follow one rule, ``<thing>_<which>_<what>``, so that a reader finds "the
-top drawer of the cabinet" by its words:
+In: a :class:`~vecenv.libero.scene.scene.Scene` with upstream's geometry. Out: name -> :class:`PartSpec`, samples in
+body frames and which joint moves the part. Names follow one rule, ``<thing>_<which>_<what>``, so that a reader finds
+"the top drawer of the cabinet" by its words:
 
 * ``<thing>_<level>_drawer``: what a slide joint moves, its handle left out; ``<thing>_<level>_handle``: what sticks out
   in front of it. ``<thing>_door`` and ``<thing>_handle``: likewise for a hinge off to one side of what it carries.

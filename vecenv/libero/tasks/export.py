@@ -74,8 +74,8 @@ def export(
     Args:
         out: the folder, created if need be.
         suites: which; all of them by default.
-        geometries: profiles of the collision geoms, see ``vecenv.libero.scene.lean.geometry``. ``"lean"`` brings ``"exact"`` with
-            it: parts of lean scenes are measured on the exact ones.
+        geometries: profiles of the collision geoms, see ``vecenv.libero.scene.lean.geometry``. ``"lean"`` brings
+            ``"exact"`` with it: parts of lean scenes are measured on the exact ones.
         contacts: those of the exported scenes, see ``vecenv.libero.scene.contacts``.
         track: called with a list of what is to be done and a word for it, returns it to iterate over: where a progress
             bar goes.

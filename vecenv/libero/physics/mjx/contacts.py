@@ -3,8 +3,8 @@
 MJX finds the collider of two geoms in a table, as MuJoCo does. This is the one place of vecenv that reaches into MJX's
 private modules. It leaves the tables and functions it finds there as they are: for marked models it runs copies of the
 functions that read a table of ours (``boxbox_warp``, ``planemesh_warp``, ``boxbox_jax``, ``planemesh_jax``), and
-unmarked ones go where they always went. What is a mark is decided by ``vecenv.libero.scene.contacts``; a model of MuJoCo Warp
-has no custom numbers, there it is a bit of the disable flags that MuJoCo does not use.
+unmarked ones go where they always went. What is a mark is decided by ``vecenv.libero.scene.contacts``; a model of
+MuJoCo Warp has no custom numbers, there it is a bit of the disable flags that MuJoCo does not use.
 
 A MuJoCo that arranges these functions in another way is refused with ``MjxContactsError``, which says so.
 """
