@@ -34,7 +34,7 @@ class Scripted(SlotBatch):
         """One tick of all slots that are not done."""
         self._check_live()
         self.failures |= fail or {}
-        before, active = self._steps.copy(), ~self._done
+        before, active = self._steps.copy(), ~self.done
         reward = self._book(active, active & np.isin(np.arange(self.num_envs), success))
         return self._control(Control, reward, before)
 
@@ -58,7 +58,7 @@ class Scripted(SlotBatch):
         return self.failures
 
     def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._book(moves & ~self._done, np.zeros(self.num_envs, bool)), np.ones(self.num_envs, bool)
+        return self._book(moves & ~self.done, np.zeros(self.num_envs, bool)), np.ones(self.num_envs, bool)
 
     def _follow(self, plan: Any, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise NotImplementedError

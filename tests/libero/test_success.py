@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from test_env import STILL, put_target_in_basket
@@ -142,8 +140,13 @@ def test_a_chunk_ends_at_success_when_the_first_tick_counts(backend: str) -> Non
 # -- what is refused ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", ["last", "", 1])
-def test_other_modes_are_refused(mode: Any) -> None:
+def test_a_mode_of_another_type_is_refused_with_its_type() -> None:
+    with pytest.raises(vecenv.OptionError, match=r"success.*str \| None.*1"):
+        vecenv.make("libero_object", task=0, episodes=[0], success=1)
+
+
+@pytest.mark.parametrize("mode", ["last", ""])
+def test_other_modes_are_refused(mode: str) -> None:
     with pytest.raises(LiberoError, match=rf"success={mode!r} is not available; available: {', '.join(SUCCESS_MODES)}"):
         vecenv.make("libero_object", task=0, episodes=[0], success=mode)
     with pytest.raises(SimplerError, match=rf"success={mode!r} is not available; available: first, final"):
