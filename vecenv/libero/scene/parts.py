@@ -80,8 +80,6 @@ def opening(model: mujoco.MjModel, joint: str) -> float:
 
 def _moving_parts(scene: Scene, entity: Entity) -> Iterator[tuple[str, PartSpec]]:
     for joint in entity.joints:
-        if not _geoms(scene, joint):  # lean geometry leaves out drawers that no task uses
-            continue
         if scene.model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_SLIDE:
             yield from _drawer(scene, entity, joint)
         elif scene.model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_HINGE:
