@@ -284,12 +284,12 @@ def test_rays_may_see_faces_from_behind() -> None:
 
 
 def test_a_renderer_with_other_arguments_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = raykernel.theirs._build_megakernel
+    made = raykernel.warp_render._build_megakernel
 
     def other(*arguments: Any) -> Any:
         return SimpleNamespace(adj=SimpleNamespace(args=made(*arguments).adj.args[1:]))
 
-    monkeypatch.setattr(raykernel.theirs, "_build_megakernel", other)
+    monkeypatch.setattr(raykernel.warp_render, "_build_megakernel", other)
     with pytest.raises(RenderError, match="other arguments"):
         small_seen(small())
 

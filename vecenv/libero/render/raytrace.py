@@ -18,13 +18,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx.warp import render_context
 
+from vecenv.libero.physics.mjx.private import render_context
 from vecenv.libero.render.drawing import Pose, View
 from vecenv.libero.render.gl import Frames, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, UserCamera, VisualOptions
-from vecenv.libero.render.ray_kernel import HEADLIGHT, make_kernel
-from vecenv.libero.render.scenery import Scenery, drawn_colors, installed_scenery
+from vecenv.libero.render.ray_kernel import make_kernel
+from vecenv.libero.render.ray_light import HEADLIGHT
+from vecenv.libero.render.scenery import Scenery, installed_scenery
+from vecenv.libero.render.surfaces import drawn_colors
 from vecenv.libero.scene.bddl import Problem
 from vecenv.util.mapped import Sized
 from vecenv.util.rotations import quat_to_mat
