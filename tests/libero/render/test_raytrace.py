@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from support.pictures import needs_gl, psnr
+from support.images import needs_gl, psnr
 
 import vecenv
 from vecenv.contract import Egocentric
@@ -462,5 +462,5 @@ def check_masks(ours: np.ndarray, theirs: np.ndarray) -> None:
         ("libero_90", 20),
     ],
 )
-def test_pictures_are_those_of_gl(suite: str, task: int) -> None:
+def test_images_are_those_of_gl(suite: str, task: int) -> None:
     compare(suite, task, 256, [0, 7])

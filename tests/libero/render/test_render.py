@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from support.pictures import needs_gl
+from support.images import needs_gl
 
 from vecenv.libero.render import gl
 from vecenv.libero.render.drawing import Pose, Stage
@@ -123,11 +123,11 @@ def test_every_slot_and_camera_gets_its_images(renderer: GlRenderer, stage: Stag
         assert frames.depth[camera].shape == frames.segmentation[camera].shape == (3, SIZE, SIZE)
     masks = frames.segmentation["agentview"] == stage.instances.index("box_1")
     columns = [np.flatnonzero(mask.any(axis=0)).mean() for mask in masks]
-    # The picture is mirrored: what lies to the camera's right is on the left.
+    # The image is mirrored: what lies to the camera's right is on the left.
     assert columns[0] > columns[1] > columns[2]
 
 
-def test_pictures_do_not_depend_on_threads_or_neighbours(renderer: GlRenderer, stage: Stage) -> None:
+def test_images_do_not_depend_on_threads_or_neighbours(renderer: GlRenderer, stage: Stage) -> None:
     shots = [shot(stage, box=(0.1 * i, 0.0)) for i in range(5)]
     together = rgb(renderer, *shots)
     alone = GlRenderer([stage], height=SIZE, width=SIZE, num_threads=1)
@@ -186,16 +186,16 @@ def test_collision_geoms_are_not_drawn(renderer: GlRenderer, stage: Stage) -> No
 
 
 def test_what_no_camera_sees_is_left_out_and_nothing_else(stage: Stage) -> None:
-    """Culling: wherever the box goes, its picture is the one with everything drawn."""
+    """Culling: wherever the box goes, its image is the one with everything drawn."""
     rng = np.random.default_rng(0)
     poses = [shot(stage, box=tuple(rng.uniform(-1.2, 1.2, 2))) for _ in range(40)]
     culled, whole = GlRenderer([stage], height=SIZE, width=SIZE), GlRenderer([stage], height=SIZE, width=SIZE)
     try:
-        pictures = rgb(culled, *poses)
+        images = rgb(culled, *poses)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(stage, "_always", np.ones(stage.model.ngeom, bool))
-            np.testing.assert_array_equal(rgb(whole, *poses), pictures)
-        assert len(np.unique(pictures.reshape(40, -1), axis=0)) > 10
+            np.testing.assert_array_equal(rgb(whole, *poses), images)
+        assert len(np.unique(images.reshape(40, -1), axis=0)) > 10
     finally:
         culled.close()
         whole.close()
@@ -222,7 +222,7 @@ MIRRORED = """
 
 
 @pytest.mark.parametrize(("kind", "size"), [("plane", "0.4 0.4 0.1"), ("plane", "0 0 0.1"), ("box", "0.4 0.4 0.02")])
-def test_a_mirror_shows_what_the_picture_does_not(kind: str, size: str) -> None:
+def test_a_mirror_shows_what_the_image_does_not(kind: str, size: str) -> None:
     scene = dataclasses.replace(
         tiny_scene(), model=mujoco.MjModel.from_xml_string(MIRRORED.format(kind=kind, size=size))
     )
@@ -235,14 +235,14 @@ def test_a_mirror_shows_what_the_picture_does_not(kind: str, size: str) -> None:
         shots.append(Shot(0, Pose(qpos, model.body_pos.copy(), model.body_quat.copy())))
     culled, whole = GlRenderer([stage], height=SIZE, width=SIZE), GlRenderer([stage], height=SIZE, width=SIZE)
     try:
-        pictures = rgb(culled, *shots)
+        images = rgb(culled, *shots)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(stage, "_always", np.ones(model.ngeom, bool))
-            np.testing.assert_array_equal(rgb(whole, *shots), pictures)
+            np.testing.assert_array_equal(rgb(whole, *shots), images)
         with pytest.MonkeyPatch.context() as patch:
             # The first is in the mirror only.
             patch.setattr(stage._mirrors, "cones", lambda *_: iter(()))
-            assert (rgb(whole, shots[0]) != pictures[0]).any()
+            assert (rgb(whole, shots[0]) != images[0]).any()
     finally:
         culled.close()
         whole.close()
@@ -253,7 +253,7 @@ def test_the_sky_is_left_out_only_where_the_floor_hides_it(stage: Stage) -> None
     down, level = (stage.view(name, pose, VisualOptions(), 0) for name in ("agentview", "side"))
     assert stage._walls.fill(stage._data, down, 1.0)
     assert not stage._walls.fill(stage._data, level, 1.0)
-    assert not stage._walls.fill(stage._data, down, 3.0)  # so wide a picture shows what is beside the floor
+    assert not stage._walls.fill(stage._data, down, 3.0)  # so wide an image shows what is beside the floor
     below = UserCamera.looking_at("below", eye=[0, 0, -2], target=[0, 0, 0], up=[1, 0, 0])
     assert not stage._walls.fill(stage._data, stage.view(below, pose, VisualOptions(), 0), 1.0)
 
@@ -346,10 +346,10 @@ def _grown(mask: np.ndarray) -> np.ndarray:
 def test_textures_are_swapped_in_one_slot_only(renderer: GlRenderer, stage: Stage) -> None:
     swapped = shot(stage, options=VisualOptions(textures={"cloth": "checks"}))
     plain = shot(stage)
-    pictures = rgb(renderer, plain, swapped, plain, swapped, plain)
-    np.testing.assert_array_equal(pictures[0], pictures[2])
-    np.testing.assert_array_equal(pictures[0], pictures[4])
-    assert (pictures[1] != pictures[0]).any()
+    images = rgb(renderer, plain, swapped, plain, swapped, plain)
+    np.testing.assert_array_equal(images[0], images[2])
+    np.testing.assert_array_equal(images[0], images[4])
+    assert (images[1] != images[0]).any()
 
 
 def test_cameras_are_shifted_in_their_own_frame(renderer: GlRenderer, stage: Stage) -> None:
@@ -456,7 +456,7 @@ def test_several_threads_may_ask_at_once(renderer: GlRenderer, stage: Stage) -> 
     for asker in askers:
         asker.join()
     assert len(seen) == 4
-    assert all(np.array_equal(picture, expected) for picture in seen)
+    assert all(np.array_equal(image, expected) for image in seen)
 
 
 def test_closing_ends_the_threads(stage: Stage) -> None:

@@ -1,6 +1,6 @@
 """Textures as LIBERO was published with, on a MuJoCo that shows them otherwise.
 
-In: a problem. Out: its scene compiled with what is drawn. With ``"published"`` pictures are those of MuJoCo 3.3.0, and
+In: a problem. Out: its scene compiled with what is drawn. With ``"published"`` images are those of MuJoCo 3.3.0, and
 up to 3.3.2, under which LIBERO's demonstrations were rendered and its checkpoints scored; with ``"current"`` those of
 the installed MuJoCo. What differs:
 

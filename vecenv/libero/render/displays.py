@@ -2,7 +2,7 @@
 
 llvmpipe fills triangles for one context of a display at a time, whatever thread it is of: two threads then keep 1.2
 cores busy (``LP_NUM_THREADS=0``) to 1.6. A context on another display does not wait. In: nothing. Out: contexts like
-MuJoCo's; where GL is Mesa's software, every other one is on a second display. Pictures are the same.
+MuJoCo's; where GL is Mesa's software, every other one is on a second display. Images are the same.
 """
 
 from __future__ import annotations

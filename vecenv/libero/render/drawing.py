@@ -100,7 +100,7 @@ class Stage:
         self._lock = threading.Lock()
         self._groups, self._shine = model.geom_group.copy(), model.mat_reflectance.copy()
         # Only meshes are left out when they are out of sight. Other shapes have few triangles, and Mesa's software
-        # driver sometimes smears a wall behind the camera into the picture: upstream's have that, so must these.
+        # driver sometimes smears a wall behind the camera into the image: upstream's have that, so must these.
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
         self._boxes, self._walls, self._mirrors = _Boxes(model), _Walls(model), _Mirrors(model)
         self._burners = _burners(model, scene)
@@ -219,20 +219,20 @@ class Stage:
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = view.pos, view.mat.ravel(), view.fovy
         seen = self._seen(view, aspect)
         model.geom_group[:] = np.where(seen | self._always, self._groups, _HIDDEN)
-        # MuJoCo draws everything once more for each mirror, also for one that is out of the picture.
+        # MuJoCo draws everything once more for each mirror, also for one that is out of the image.
         model.mat_reflectance[:] = np.where(np.isin(np.arange(model.nmat), model.geom_matid[seen]), self._shine, 0)
         eye = mujoco.MjvCamera()
         eye.type, eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         mujoco.mjv_updateScene(model, data, self._option, None, eye, mujoco.mjtCatBit.mjCAT_ALL, frame)
-        # The sky fills the whole picture first, which costs as much as all walls.
+        # The sky fills the whole image first, which costs as much as all walls.
         frame.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = not self._walls.fill(data, view, aspect)
         model.geom_group[:], model.mat_reflectance[:] = self._groups, self._shine
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = before
         return view
 
     def _seen(self, view: View, aspect: float) -> np.ndarray:
-        """Geoms that are in the picture, or in a mirror that is, bool [ngeom]."""
-        seen = self._boxes.in_sight(self._data, _Cone.of_picture(view, aspect, self.clip_planes[0]))
+        """Geoms that are in the image, or in a mirror that is, bool [ngeom]."""
+        seen = self._boxes.in_sight(self._data, _Cone.of_image(view, aspect, self.clip_planes[0]))
         for cone in self._mirrors.cones(self._data, view, seen):
             seen = seen | self._boxes.in_sight(self._data, cone)
         return seen
@@ -298,15 +298,15 @@ class _Cone:
     bounds: np.ndarray
 
     @classmethod
-    def of_picture(cls, view: View, aspect: float, near: float) -> _Cone:
-        """What lies beyond the near plane of a camera and between the sides of its picture."""
+    def of_image(cls, view: View, aspect: float, near: float) -> _Cone:
+        """What lies beyond the near plane of a camera and between the sides of its image."""
         return cls(_side_normals(view, aspect), view.pos, np.array([-near, 0.0, 0.0, 0.0, 0.0]))
 
 
 class _Boxes:
     """The bounding boxes of a model's geoms, for leaving out what a camera cannot see.
 
-    MuJoCo draws everything, and what lies outside the picture costs more than what is in it: software GL clips its
+    MuJoCo draws everything, and what lies outside the image costs more than what is in it: software GL clips its
     triangles one by one.
     """
 
@@ -368,8 +368,8 @@ class _Walls:
         self._half, self._is_plane = half, planes
 
     def fill(self, data: mujoco.MjData, view: View, aspect: float) -> bool:
-        """Whether all of a grid of rays over the picture, its corners included, end at a wall."""
-        rays = _picture_rays(view, aspect)
+        """Whether all of a grid of rays over the image, its corners included, end at a wall."""
+        rays = _image_rays(view, aspect)
         turn = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
         eye = np.einsum("nji,nj->ni", turn, view.pos - data.geom_xpos[self._geoms])[:, None]
         way = rays @ turn
@@ -382,8 +382,8 @@ class _Walls:
         return bool(((first <= last) & (first > 0) & front).any(axis=0).all())
 
 
-def _picture_rays(view: View, aspect: float) -> np.ndarray:
-    """Directions from the camera to a grid of points over its picture, world frame, [rays, 3]."""
+def _image_rays(view: View, aspect: float) -> np.ndarray:
+    """Directions from the camera to a grid of points over its image, world frame, [rays, 3]."""
     up = np.tan(np.deg2rad(view.fovy) / 2) * np.linspace(-1, 1, _GRID)
     x, y = np.meshgrid(up * aspect, up)
     return np.stack([x.ravel(), y.ravel(), -np.ones(x.size)], axis=1) @ view.mat.T

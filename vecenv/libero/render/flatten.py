@@ -50,7 +50,7 @@ class Burner:
 
 @dataclass(frozen=True, kw_only=True)
 class Flattened:
-    """A flat model and what its geoms stand for; the attributes are those of ``vecenv.libero.render.scenery.Scenery``."""
+    """A flat model and what its geoms stand for; attributes as in ``vecenv.libero.render.scenery.Scenery``."""
 
     model: mujoco.MjModel
     instances: tuple[str, ...]

@@ -1,7 +1,7 @@
-"""Pictures of a batch in GL: a few threads, each with one GL context, take slots one by one.
+"""Images of a batch in GL: a few threads, each with one GL context, take slots one by one.
 
 In: a stage a scene (``vecenv.libero.render.drawing``), a shot a slot, cameras. Out: arrays [B, H, W, ...] of colours,
-depths and instances, and where the cameras are. MuJoCo's own renderer draws, so ``lod="exact"`` is upstream's picture;
+depths and instances, and where the cameras are. MuJoCo's own renderer draws, so ``lod="exact"`` is upstream's image;
 it releases Python's lock while it draws, so threads draw in parallel and there is no process an environment. A thread
 uploads a scene the first time it draws it, and threads prefer scenes they have.
 

@@ -1,4 +1,4 @@
-"""What a picture is taken of and with, as data: cameras, what may look different in a slot, and how to render.
+"""What an image is taken of and with, as data: cameras, what may look different in a slot, and how to render.
 
 Nothing here draws. ``RenderConfig`` goes into ``vecenv.make``; ``UserCamera`` adds a viewpoint; ``VisualOptions``
 changes light, viewpoint, colours and textures of one slot, and ``VisualVariation.draw`` makes one from a seed.
@@ -171,12 +171,12 @@ class RenderConfig:
 
     Attributes:
         height, width: of every image, pixels.
-        lod: ``"exact"``, upstream's picture to within what can be seen; ``"original"``, with every triangle that
+        lod: ``"exact"``, upstream's image to within what can be seen; ``"original"``, with every triangle that
             upstream draws; or ``"fast"``, simplified meshes (``vecenv.libero.render.lod``).
         cameras: cameras besides those of the scene.
         gl: ``"egl"``, ``"osmesa"``, or None for what ``MUJOCO_GL`` says, else the first of them that works.
         engine: ``"gl"``, upstream's renderer; or ``"raytrace"``, MuJoCo Warp's, which needs no GL and is fast on NVIDIA
-            GPUs; its pictures differ a little, and of visual options it swaps no textures and colours no materials.
+            GPUs; its images differ a little, and of visual options it swaps no textures and colours no materials.
         num_threads: rendering threads, each with a GL context; None for one a core.
         colors: ``"published"``, textures as MuJoCo up to 3.3.2 shows them, under which LIBERO's demonstrations were
             rendered and its checkpoints scored; or ``"current"``, as the installed MuJoCo shows them

@@ -1,4 +1,4 @@
-"""The Warp kernel that traces one ray per thread, in place of MuJoCo Warp's renderer, with GL's light instead of its own.
+"""The Warp kernel that traces one ray per thread, in place of MuJoCo Warp's own, with the light of GL.
 
 In: a render context of MuJoCo Warp and the model it is of. Out: a kernel with the arguments that MuJoCo Warp's renderer
 launches its own with; it packs them into the structs of ``ray_types``. What differs from MuJoCo Warp's kernel:

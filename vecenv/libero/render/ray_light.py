@@ -1,11 +1,9 @@
-"""The light that arrives at a surface, as GL computes it: ambient, diffuse and specular light of every lamp, no shadows.
+"""The light that arrives at a surface, as GL computes it: ambient, diffuse and specular, without shadows.
 
 In: the lights of a world and a point of a surface. Out: the light that its colour is multiplied with, and the
 highlights that are added. Unlike MuJoCo Warp, and like GL, a light's ambient part fades with the rest of it.
 """
 
-# Warp tells variables from constants by calls such as `float(0.0)`.
-# ruff: noqa: UP018
 # Type checkers know neither its arrays nor its arithmetic.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # pyright: reportCallIssue=false, reportReturnType=false, reportIndexIssue=false, reportGeneralTypeIssues=false

@@ -49,7 +49,7 @@ def _hit_plane(size: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> float:
 
 @wp.func
 def _hit_box(size: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> tuple[float, wp.vec3]:
-    """Distance to a box along a ray in its frame, and the normal of the face it enters; -1 if it misses or is inside."""
+    """Distance to a box along a ray in its frame (-1: it misses or starts inside), and the normal where it enters."""
     near, last = float(-1.0), float(1e10)
     normal = wp.vec3(0.0)
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""Pictures of worlds by ray tracing inside ``jax.jit``: MuJoCo Warp's renderer, on NVIDIA GPUs, without GL.
+"""Images of worlds by ray tracing inside ``jax.jit``: MuJoCo Warp's renderer, on NVIDIA GPUs, without GL.
 
 In: a scenery (``vecenv.libero.render.scenery``) and, for each world, the poses of its bodies as MJX keeps them. Out:
 images of one or several cameras, as delivered everywhere in vecenv: rows from the top, mirrored. ``RayTracer.look`` is

@@ -19,7 +19,7 @@ from vecenv.libero.render import lod
 from vecenv.libero.render.colors import set_decoding
 from vecenv.libero.render.flatten import Burner, flatten
 from vecenv.libero.render.options import RenderError, check_colors
-from vecenv.libero.scene.bddl import Problem
+from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.libero.scene.scene import Scene, compile_scene
 
 # Version of the files; it counts up when their contents change.
@@ -139,4 +139,4 @@ def installed_scenery(problem: Problem, level: str = "fast", colors: str = "publ
 
 
 # Sceneries stay while something uses them.
-_sceneries: weakref.WeakValueDictionary[tuple[object, str, str], Scenery] = weakref.WeakValueDictionary()
+_sceneries: weakref.WeakValueDictionary[tuple[SceneKey, str, str], Scenery] = weakref.WeakValueDictionary()
