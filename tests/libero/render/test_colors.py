@@ -172,7 +172,7 @@ def test_a_scenery_of_other_colours_is_refused() -> None:
     physics = installed_tasks("libero_object")[0].scene(()).model
     scenery = installed_scenery(problem(DECODED), colors="current")
     scenery.check(physics, "current")
-    with pytest.raises(RenderError, match=r"made with colors='current' and colors='published' is asked for"):
+    with pytest.raises(RenderError, match=r"made with colors='current' but colors='published' is requested"):
         scenery.check(physics, "published")
 
 

@@ -325,7 +325,7 @@ def test_functional_images_have_the_colours_that_are_asked_for(tmp_path: Path) -
         obs=("proprio", "pixels"),
         scenery=str(tmp_path / "dark.npz"),
     )
-    with pytest.raises(RenderError, match="made with colors='current' and colors='published' is asked for"):
+    with pytest.raises(RenderError, match="made with colors='current' but colors='published' is requested"):
         LiberoEnv("libero_spatial", task=0, config=config)
     LiberoEnv("libero_spatial", task=0, config=dataclasses.replace(config, colors="current"))
 
@@ -358,8 +358,8 @@ def test_an_engine_that_is_not_there_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (VisualOptions(textures={"floor": "squares"}), "swaps no textures"),
-        (VisualOptions(colors={"floor": (1, 0, 0)}), "'floor' is none; there are all"),
+        (VisualOptions(textures={"floor": "squares"}), "cannot swap textures"),
+        (VisualOptions(colors={"floor": (1, 0, 0)}), "'floor' is none; instances: all"),
     ],
 )
 def test_what_rays_cannot_show_is_refused(options: VisualOptions, problem: str) -> None:
