@@ -2,8 +2,8 @@
 
 Upstream runs one process a core, each an ``OffScreenRenderEnv``; vecenv runs one process with as many threads, once
 with upstream's image (``lod="exact"``) and once with simplified meshes (``"fast"``). All draw in the same software GL
-and take the same random actions. The three sides take turns within one run, a few control steps each, so what else the
-machine does falls on all of them; rates are environment control steps a second, medians over the turns, and ratios are
+and take the same random actions. The three sides take turns within one run, a few control steps each, so other load
+on the machine affects all of them; rates are environment control steps a second, medians over the turns, and ratios are
 medians of the turns' ratios. ``psnr`` and ``ssim`` compare ``"fast"`` with ``"exact"``, the worst image of the run.
 """
 

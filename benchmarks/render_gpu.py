@@ -1,13 +1,12 @@
-"""Environment steps a second with two ray-traced camera images every control step, on a GPU; and how good these are.
+"""Environment steps a second with two ray-traced camera images every control step, on a GPU, and their quality.
 
 For every scene, image size and batch size, one compiled loop of control steps of the functional environment under
 random actions: physics alone, images alone (of the same worlds, moved a little each time), and both. The three take
-turns; nothing else may use the GPU meanwhile. Images are held against GL's of the same states where there are some:
-``--references`` is a folder of ``suite_task_size.npz`` with ``xpos``, ``xquat``, ``qpos``, ``rgb``, ``seg`` of N
-states.
+turns; nothing else may use the GPU meanwhile. With ``--references``, a folder of ``suite_task_size.npz`` with ``xpos``,
+``xquat``, ``qpos``, ``rgb``, ``seg`` of N states, images are compared with GL's of the same states.
 
-The GPU's machine needs neither GL nor LIBERO: ``--scenes`` is what ``vecenv compile`` wrote; ``--sceneries`` (a folder
-of ``suite_task.npz``) and references are made by ``--write`` on a machine that has both.
+The GPU's machine needs neither GL nor LIBERO: ``--scenes`` is a folder that ``vecenv compile`` wrote; ``--sceneries``,
+a folder of ``suite_task.npz``, and references are written by ``--write`` on a machine that has both.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from vecenv.libero.render.scenery import Scenery
 
 # Control steps of one timed call.
 STEPS = 4
-# Instances of fewer pixels are not counted: at their edge a pixel is much.
+# Instances of fewer pixels are not counted: one pixel at their edge changes the IoU much.
 LEAST_PIXELS = 100
 
 
@@ -164,7 +163,7 @@ class Loops:
 
 
 def quality(scenery: Scenery, suite: str, task: int, size: int, options: argparse.Namespace) -> dict[str, Any]:
-    """How close to GL's images: the lowest and the mean PSNR, dB, and the lowest IoU of an instance's masks."""
+    """How close the images are to GL's: the lowest and the mean PSNR, dB, and the lowest IoU of an instance's masks."""
     path = options.references / f"{suite}_{task}_{size}.npz"
     if not path.exists():
         return {"PSNR min": "-", "PSNR mean": "-", "IoU min": "-"}

@@ -1,9 +1,9 @@
 """Images of a batch in GL: a few threads, each with one GL context, render slots one by one.
 
 In: a stage per scene (``vecenv.libero.render.drawing``), a shot per slot, cameras. Out: arrays [B, H, W, ...] of
-colours, depths and instances, and the cameras' poses. MuJoCo's own renderer draws, so ``lod="exact"`` is upstream's image;
-it releases Python's lock while it draws, so threads draw in parallel and no environment needs a process of its own. A
-thread uploads a scene the first time it draws it, and prefers scenes that it has uploaded.
+colours, depths and instances, and the cameras' poses. MuJoCo's own renderer draws, so ``lod="exact"`` is upstream's
+image. It releases Python's lock while it draws, so threads draw in parallel and no environment needs a process of its
+own. A thread uploads a scene the first time it draws it, and prefers scenes that it has uploaded.
 
 EGL and OSMesa both draw without a display; physics needs neither.
 """
@@ -24,7 +24,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -45,6 +44,8 @@ _VARIABLE = "MUJOCO_GL"
 _ATTEMPTS = 2
 _AS_CODES = (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR)
 
+# A future, a function and its arguments.
+_Call = tuple[Future[object], Callable[..., object], tuple[object, ...]]
 # EGL's display is opened with the first context, by one thread at a time.
 _opening = threading.Lock()
 
@@ -434,14 +435,14 @@ class _Thread:
 
     def __init__(self, painter: _Painter) -> None:
         self.painter = painter
-        self._calls: queue.SimpleQueue[tuple[Future, Callable[..., Any], tuple] | None] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()
         # A daemon thread: at exit, Python waits for other threads before a renderer can be closed.
         self._thread = threading.Thread(target=self._loop, name="vecenv-gl", daemon=True)
         self._thread.start()
 
-    def run(self, call: Callable[..., Any], *arguments: Any) -> Future:
+    def run(self, call: Callable[..., object], *arguments: object) -> Future[object]:
         """Call in this thread."""
-        future: Future = Future()
+        future: Future[object] = Future()
         self._calls.put((future, call, arguments))
         return future
 
@@ -456,7 +457,7 @@ class _Thread:
         self.painter.close()
 
 
-def _answer(future: Future, call: Callable[..., Any], arguments: Iterable[Any]) -> None:
+def _answer(future: Future[object], call: Callable[..., object], arguments: Iterable[object]) -> None:
     try:
         future.set_result(call(*arguments))
     except BaseException as error:

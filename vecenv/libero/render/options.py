@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from vecenv.errors import InvalidInput
 
@@ -224,34 +225,19 @@ def check_colors(colors: str) -> None:
         raise RenderError(f"colors={colors!r}: expected one of {', '.join(COLORS)}")
 
 
-def matrix_of(quat: np.ndarray) -> np.ndarray:
+def matrix_of(quat: npt.ArrayLike) -> np.ndarray:
     """Rotation matrix [3, 3] of a quaternion wxyz [4] of any length but 0."""
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(np.asarray(quat, float), scalar_first=True).as_matrix()
 
 
-def quat_of(matrix: np.ndarray) -> np.ndarray:
+def quat_of(matrix: npt.ArrayLike) -> np.ndarray:
     """Quaternion wxyz [4] of a rotation matrix [3, 3]."""
-    import mujoco
-
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(matrix, float).ravel())
-    return quat
+    return Rotation.from_matrix(np.asarray(matrix, float)).as_quat(scalar_first=True)
 
 
 def rotation_of(vector: Sequence[float]) -> np.ndarray:
     """Rotation matrix [3, 3] of a rotation vector [3], radians."""
-    turn = np.asarray(vector, float)
-    angle = float(np.linalg.norm(turn))
-    if angle == 0.0:
-        return np.eye(3)
-    return matrix_of(np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * turn / angle]))
+    return Rotation.from_rotvec(np.asarray(vector, float)).as_matrix()
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,10 +27,14 @@ from vecenv.libero.render.ray_kernel import make_kernel
 from vecenv.libero.render.ray_light import HEADLIGHT
 from vecenv.libero.render.scenery import Scenery, installed_scenery
 from vecenv.libero.render.surfaces import drawn_colors
-from vecenv.libero.scene.bddl import Problem
+from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.util.mapped import Sized
 from vecenv.util.rotations import quat_to_mat
 
+if TYPE_CHECKING:
+    from mujoco.mjx.third_party.mujoco_warp import RenderContext
+
+_LookKey = tuple[SceneKey, tuple[str, ...], Wanted]
 # Threads of a block on the GPU, registers of a thread, and the tile of pixels, rows and columns, that threads next to
 # each other trace: rays that travel together are faster. Measured on an H200, benchmarks/render_gpu.py.
 BLOCK, REGISTERS, TILE = 128, 96, (8, 8)
@@ -170,7 +174,7 @@ class RayTracer:
                 self._contexts[num_worlds] = context
         return self._contexts[num_worlds].pytree()
 
-    def _tile_rays(self, context: Any) -> None:
+    def _tile_rays(self, context: RenderContext) -> None:
         """Reorder a render context's rays from rows of pixels to tiles, for each camera and sample."""
         (rows, columns), rays = self._tile, context.ray.numpy()
         tiled = rays.reshape(-1, self.height // rows, rows, self.width // columns, columns, 3).swapaxes(2, 3)
@@ -259,6 +263,9 @@ class RayTracer:
         return table[codes[..., 0]]  # -1, the table's last entry, is the background
 
 
+_Compiled = tuple[RayTracer, Callable[..., Seen]]
+
+
 class RayRenderer:
     """Renders batches as ``vecenv.libero.render.gl.GlRenderer`` does, without GL: one call of ``RayTracer`` per
     scene.
@@ -270,7 +277,7 @@ class RayRenderer:
     def __init__(self, config: RenderConfig) -> None:
         self._config = config
         self._user_cameras = {camera.name: camera for camera in config.cameras}
-        self._looks: dict[tuple, tuple[RayTracer, Any]] = {}
+        self._looks: dict[_LookKey, _Compiled] = {}
 
     def render(
         self,
@@ -301,15 +308,15 @@ class RayRenderer:
             styles = self._styles(tracer, cameras, slots, [shots[slot].options for slot in slots])
             seen = look(*_states(model, [shots[slot].pose for slot in slots]), *styles)
             for images, made in ((rgb, seen.rgb), (depth, seen.depth), (segmentation, seen.segmentation)):
-                for number, name in enumerate(cameras if images else ()):
-                    images[name][slots] = np.asarray(made[:, number])
+                for number, name in enumerate(cameras if made is not None else ()):
+                    images[name][slots] = np.asarray(made)[:, number]
         return Frames(rgb, depth, segmentation, {})
 
     def close(self) -> None:
         """Drop what was compiled. Closing twice is harmless."""
         self._looks = {}
 
-    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> tuple[RayTracer, Any]:
+    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> _Compiled:
         key = (problem.scene_key(), cameras, wanted)
         if key not in self._looks:
             tracer = RayTracer(
