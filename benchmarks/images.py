@@ -20,7 +20,7 @@ from typing import Any
 
 from common import ROOT, report
 from images_peer import MOMENTS
-from support.pictures import Reference, agreement
+from support.images import Reference, agreement
 
 from vecenv.libero.render.gl import choose
 from vecenv.libero.render.options import RenderConfig

@@ -1,9 +1,9 @@
 """Physics and two 256 x 256 images every control step: vecenv against upstream's SubprocVectorEnv at equal cores.
 
 Upstream runs one process a core, each an ``OffScreenRenderEnv``; vecenv runs one process with as many threads, once
-with upstream's picture (``lod="exact"``) and once with simplified meshes (``"fast"``). All draw in the same software GL
-and take the same random actions. The three sides take turns within one run, a few control steps each, so what else the
-machine does falls on all of them; rates are environment control steps a second, medians over the turns, and ratios are
+with upstream's image (``lod="exact"``) and once with simplified meshes (``"fast"``). All draw in the same software GL
+and take the same random actions. The three sides take turns within one run, a few control steps each, so other load
+on the machine affects all of them; rates are environment control steps a second, medians over the turns, and ratios are
 medians of the turns' ratios. ``psnr`` and ``ssim`` compare ``"fast"`` with ``"exact"``, the worst image of the run.
 """
 
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from common import report
-from support.pictures import psnr, ssim
+from support.images import psnr, ssim
 
 import vecenv
 from vecenv.libero.render.options import RenderConfig
@@ -83,10 +83,10 @@ def compare(suite: str, task: int, turns: int, ticks: int, slots: int) -> dict[s
     worst = [np.inf, np.inf]
     for turn in range(turns + 1):  # the first warms up
         found = {"upstream": rate(theirs, cores, ticks, np.random.default_rng(turn))[0]}
-        pictures = {}
+        images = {}
         for lod, (_, step) in ours.items():
-            found[lod], pictures[lod] = rate(step, slots, ticks, np.random.default_rng(turn))
-        for exact, fast in zip(*(np.concatenate(pictures[lod]) for lod in ("exact", "fast")), strict=True):
+            found[lod], images[lod] = rate(step, slots, ticks, np.random.default_rng(turn))
+        for exact, fast in zip(*(np.concatenate(images[lod]) for lod in ("exact", "fast")), strict=True):
             worst = [min(worst[0], psnr(exact, fast)), min(worst[1], ssim(exact, fast))]
         if turn:
             for name, value in found.items():

@@ -1,13 +1,12 @@
-"""Environment steps a second with two ray-traced camera images every control step, on a GPU; and how good these are.
+"""Environment steps a second with two ray-traced camera images every control step, on a GPU, and their quality.
 
 For every scene, image size and batch size, one compiled loop of control steps of the functional environment under
 random actions: physics alone, images alone (of the same worlds, moved a little each time), and both. The three take
-turns; nothing else may use the GPU meanwhile. Pictures are held against GL's of the same states where there are some:
-``--references`` is a folder of ``suite_task_size.npz`` with ``xpos``, ``xquat``, ``qpos``, ``rgb``, ``seg`` of N
-states.
+turns; nothing else may use the GPU meanwhile. With ``--references``, a folder of ``suite_task_size.npz`` with ``xpos``,
+``xquat``, ``qpos``, ``rgb``, ``seg`` of N states, images are compared with GL's of the same states.
 
-The GPU's machine needs neither GL nor LIBERO: ``--scenes`` is what ``vecenv compile`` wrote; ``--sceneries`` (a folder
-of ``suite_task.npz``) and references are made by ``--write`` on a machine that has both.
+The GPU's machine needs neither GL nor LIBERO: ``--scenes`` is a folder that ``vecenv compile`` wrote; ``--sceneries``,
+a folder of ``suite_task.npz``, and references are written by ``--write`` on a machine that has both.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from vecenv.libero.render.scenery import Scenery
 
 # Control steps of one timed call.
 STEPS = 4
-# Instances of fewer pixels are not counted: at their edge a pixel is much.
+# Instances of fewer pixels are not counted: one pixel at their edge changes the IoU much.
 LEAST_PIXELS = 100
 
 
@@ -65,7 +64,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--scenes", help="folder that `vecenv compile` wrote")
     parser.add_argument("--sceneries", type=Path, default=Path("sceneries"))
     parser.add_argument("--references", type=Path)
-    parser.add_argument("--pictures", type=Path, help="folder for pictures beside their references")
+    parser.add_argument("--images", type=Path, help="folder for images beside their references")
     parser.add_argument("--write", action="store_true", help="make sceneries and references, on a machine with GL")
     parser.add_argument("--name", default="render_gpu", help="name of the results file")
     return parser.parse_args()
@@ -164,7 +163,7 @@ class Loops:
 
 
 def quality(scenery: Scenery, suite: str, task: int, size: int, options: argparse.Namespace) -> dict[str, Any]:
-    """How close to GL's pictures: the lowest and the mean PSNR, dB, and the lowest IoU of an instance's masks."""
+    """How close the images are to GL's: the lowest and the mean PSNR, dB, and the lowest IoU of an instance's masks."""
     path = options.references / f"{suite}_{task}_{size}.npz"
     if not path.exists():
         return {"PSNR min": "-", "PSNR mean": "-", "IoU min": "-"}
@@ -175,8 +174,8 @@ def quality(scenery: Scenery, suite: str, task: int, size: int, options: argpars
     rgb, seg = np.asarray(seen.rgb), np.asarray(seen.segmentation)
     ratios = [psnr(a, b) for a, b in zip(merged(rgb), merged(reference["rgb"]), strict=True)]
     overlaps = ious(seg, reference["seg"])
-    if options.pictures:
-        save_pictures(options.pictures / f"{suite}_{task}_{size}.png", reference["rgb"], rgb)
+    if options.images:
+        save_images(options.images / f"{suite}_{task}_{size}.png", reference["rgb"], rgb)
     return {
         "PSNR min": round(min(ratios), 1),
         "PSNR mean": round(float(np.mean(ratios)), 1),
@@ -201,8 +200,8 @@ def ious(a: np.ndarray, b: np.ndarray) -> list[float]:
     return [float(((a == i) & (b == i)).sum() / ((a == i) | (b == i)).sum()) for i in shown]
 
 
-def save_pictures(path: Path, left: np.ndarray, right: np.ndarray) -> None:
-    """GL's picture and the ray tracer's side by side, a row for each camera of the first and last state."""
+def save_images(path: Path, left: np.ndarray, right: np.ndarray) -> None:
+    """GL's image and the ray tracer's side by side, a row for each camera of the first and last state."""
     from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -227,7 +226,7 @@ def write(options: argparse.Namespace) -> None:
 
 
 def references(suite: str, task: int, size: int) -> dict[str, Any]:
-    """States of two episodes, at their start and after eight random actions, and GL's pictures of them."""
+    """States of two episodes, at their start and after eight random actions, and GL's images of them."""
     import vecenv
     from vecenv.libero.render.options import RenderConfig
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vecenv_eval.film import GAP, TITLE_HEIGHT, VideoWriter, recording, render_grid
+from vecenv_eval.video.grid import GAP, TITLE_HEIGHT, render_grid
+from vecenv_eval.video.writer import VideoWriter, recording
 
 from vecenv.libero.render.options import RenderError
 
@@ -141,7 +142,7 @@ class Countdown:
 def test_every_tick_of_a_batch_is_a_frame_and_the_last_shows_the_verdicts(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     pytest.importorskip("PIL")
-    env = Countdown()
+    env: Any = Countdown()
     with recording(env, tmp_path / "batch.mp4"):
         for _ in range(3):
             env.step()
@@ -155,21 +156,21 @@ def test_every_tick_of_a_batch_is_a_frame_and_the_last_shows_the_verdicts(tmp_pa
 
 @pytest.mark.parametrize("option", [{"size": 64}, {"lod": "fast"}])
 def test_simplers_images_have_one_size_and_detail(option: dict[str, Any]) -> None:
-    from vecenv_eval.video import _environment
+    from vecenv_eval.video.episodes import make_env
 
     with pytest.raises(ValueError, match=f"--{next(iter(option))}"):
-        _environment("simpler/bridge", "0", 1, option)
+        make_env("simpler/bridge", "0", 1, option)
 
 
 def test_a_simpler_video_runs_at_its_robots_rate(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     pytest.importorskip("PIL")
     import imageio
-    from vecenv_eval.video import film
+    from vecenv_eval.video.episodes import record_rollout
 
     env: Any = Countdown()
     env.robot = SimpleNamespace(control_hz=5)
     env.step_continuous = lambda _: (env.step(), SimpleNamespace(done=np.array([env.ticks >= 6] * 2)))[1]
-    actor = SimpleNamespace(reset=lambda *_: None, act=lambda _: None)
-    assert film(env, actor, tmp_path / "simpler.mp4", ["agentview"]) == 7
+    policy: Any = SimpleNamespace(reset=lambda *_: None, act=lambda _: None)
+    assert record_rollout(env, policy, tmp_path / "simpler.mp4", ["agentview"]) == 7
     assert imageio.get_reader(tmp_path / "simpler.mp4").get_meta_data()["fps"] == 5

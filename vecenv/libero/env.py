@@ -35,7 +35,7 @@ from vecenv.libero.physics import budgets, settling
 from vecenv.libero.physics.base import SETTLE_ACTION, Group, Physics, Start
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.build import make_physics
-from vecenv.libero.render.cameras import Eyes, options_of
+from vecenv.libero.render.cameras import CameraRig, options_of
 from vecenv.libero.render.options import VisualOptions
 from vecenv.libero.scene import goals, surface
 from vecenv.libero.scene.bddl import Problem, SceneKey
@@ -101,7 +101,7 @@ class LiberoEnv(SlotBatch):
         self.config = replace(config, **vars(self._rules))
         self._sources = tasks
         self._physics: Physics | None = None
-        self._eyes = Eyes(self._rules.render, self.num_envs)
+        self._cameras = CameraRig(self._rules.render, self.num_envs)
         self._place(placement)
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
@@ -270,7 +270,7 @@ class LiberoEnv(SlotBatch):
     def close(self) -> None:
         """Release physics and renderer; the environment cannot be used afterwards. Closing twice is harmless."""
         self._close_physics()
-        self._eyes.close()
+        self._cameras.close()
         self._closed = True
 
     def _close_physics(self) -> None:
@@ -337,7 +337,7 @@ class LiberoEnv(SlotBatch):
         physics = self.physics
         state = np.concatenate([physics.eef_pos, axis_angle(physics.eef_quat), physics.fingers], axis=1)
         problems = [self._tasks[int(self._placement.task[group.slots[0]])].problem for group in physics.groups]
-        seen = self._eyes.look(physics.groups, problems)
+        seen = self._cameras.capture(physics.groups, problems)
         return Egocentric(
             state=state.astype(np.float32),
             images=seen.images,
@@ -357,7 +357,7 @@ class LiberoEnv(SlotBatch):
             RenderError: not as many as slots. A name that a scene does not have is found when an image is read.
         """
         self._check_open()
-        self._eyes.options = options_of(options, self.num_envs)
+        self._cameras.options = options_of(options, self.num_envs)
 
     def observe_objects(self, points: str = "surface") -> Objects:
         """Ground truth of every slot.

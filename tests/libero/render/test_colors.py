@@ -14,13 +14,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from support.images import Reference, agreement, needs_gl
 from support.paths import DATA
-from support.pictures import Reference, agreement, needs_gl
 
 import vecenv
 from vecenv.libero.functional.env import FunctionalConfig, FunctionalError
-from vecenv.libero.render import cameras as eyes
-from vecenv.libero.render import colors
+from vecenv.libero.render import cameras, colors
 from vecenv.libero.render.gl import choose, open_context
 from vecenv.libero.render.options import RenderConfig, RenderError, VisualOptions
 from vecenv.libero.render.scenery import Scenery, installed_scenery
@@ -134,8 +133,8 @@ def test_colours_that_there_are_none_of_are_refused(tmp_path: Path) -> None:
 
 def test_scenes_of_different_colours_are_kept_apart() -> None:
     physics = installed_tasks("libero_object")[0].scene(()).model
-    stages = {each: eyes.stage_of(problem(DECODED), physics, "fast", each) for each in ("published", "current")}
-    assert eyes.stage_of(problem(DECODED), physics, "fast", "current") is stages["current"]
+    stages = {each: cameras.stage_of(problem(DECODED), physics, "fast", each) for each in ("published", "current")}
+    assert cameras.stage_of(problem(DECODED), physics, "fast", "current") is stages["current"]
     srgb = int(mujoco.mjtColorSpace.mjCOLORSPACE_SRGB)
     assert (stages["current"].model.tex_colorspace == srgb).sum() == 2
     assert not (stages["published"].model.tex_colorspace == srgb).any()
@@ -173,7 +172,7 @@ def test_a_scenery_of_other_colours_is_refused() -> None:
     physics = installed_tasks("libero_object")[0].scene(()).model
     scenery = installed_scenery(problem(DECODED), colors="current")
     scenery.check(physics, "current")
-    with pytest.raises(RenderError, match=r"made with colors='current' and colors='published' is asked for"):
+    with pytest.raises(RenderError, match=r"made with colors='current' but colors='published' is requested"):
         scenery.check(physics, "published")
 
 

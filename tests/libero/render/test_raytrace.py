@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from support.pictures import needs_gl, psnr
+from support.images import needs_gl, psnr
 
 import vecenv
 from vecenv.contract import Egocentric
@@ -284,12 +284,12 @@ def test_rays_may_see_faces_from_behind() -> None:
 
 
 def test_a_renderer_with_other_arguments_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = raykernel.theirs._build_megakernel
+    made = raykernel.warp_render._build_megakernel
 
     def other(*arguments: Any) -> Any:
         return SimpleNamespace(adj=SimpleNamespace(args=made(*arguments).adj.args[1:]))
 
-    monkeypatch.setattr(raykernel.theirs, "_build_megakernel", other)
+    monkeypatch.setattr(raykernel.warp_render, "_build_megakernel", other)
     with pytest.raises(RenderError, match="other arguments"):
         small_seen(small())
 
@@ -325,7 +325,7 @@ def test_functional_images_have_the_colours_that_are_asked_for(tmp_path: Path) -
         obs=("proprio", "pixels"),
         scenery=str(tmp_path / "dark.npz"),
     )
-    with pytest.raises(RenderError, match="made with colors='current' and colors='published' is asked for"):
+    with pytest.raises(RenderError, match="made with colors='current' but colors='published' is requested"):
         LiberoEnv("libero_spatial", task=0, config=config)
     LiberoEnv("libero_spatial", task=0, config=dataclasses.replace(config, colors="current"))
 
@@ -358,8 +358,8 @@ def test_an_engine_that_is_not_there_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (VisualOptions(textures={"floor": "squares"}), "swaps no textures"),
-        (VisualOptions(colors={"floor": (1, 0, 0)}), "'floor' is none; there are all"),
+        (VisualOptions(textures={"floor": "squares"}), "cannot swap textures"),
+        (VisualOptions(colors={"floor": (1, 0, 0)}), "'floor' is none; instances: all"),
     ],
 )
 def test_what_rays_cannot_show_is_refused(options: VisualOptions, problem: str) -> None:
@@ -462,5 +462,5 @@ def check_masks(ours: np.ndarray, theirs: np.ndarray) -> None:
         ("libero_90", 20),
     ],
 )
-def test_pictures_are_those_of_gl(suite: str, task: int) -> None:
+def test_images_are_those_of_gl(suite: str, task: int) -> None:
     compare(suite, task, 256, [0, 7])

@@ -1,27 +1,21 @@
-"""Rendering batches: threads, cameras, images, visual options, and what happens when GL is missing or fails.
+"""Rendering batches: threads, cameras, images and visual options, on a scene of a few boxes.
 
-Most of it on a scene of a few boxes that compiles in a millisecond; `test_render_libero.py` has the real ones.
+`test_render_libero.py` has the real scenes, `test_render_failures.py` what happens when GL is missing or fails.
 """
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
-import os
-import threading
-from collections.abc import Iterator
-from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
-from support.pictures import needs_gl
+from support.box_scene import SIZE, rgb, shot, tiny_scene
+from support.images import needs_gl
 
-from vecenv.libero.render import gl
 from vecenv.libero.render.drawing import Pose, Stage
-from vecenv.libero.render.gl import GlError, GlRenderer, Shot, Wanted, available, choose
+from vecenv.libero.render.gl import GlRenderer, Shot, Wanted
 from vecenv.libero.render.options import (
     CameraShift,
     RenderConfig,
@@ -30,86 +24,8 @@ from vecenv.libero.render.options import (
     VisualOptions,
     VisualVariation,
 )
-from vecenv.libero.scene.arenas import ARENAS
-from vecenv.libero.scene.scene import Entity, Scene
-
-XML = """
-<mujoco>
-  <asset>
-    <texture name="checks" type="2d" builtin="checker" rgb1="1 0 0" rgb2="0 0 1" width="64" height="64"/>
-    <texture name="plain" type="2d" builtin="flat" rgb1="0 1 0" width="64" height="64"/>
-    <material name="cloth" texture="plain"/>
-    <mesh name="cube" vertex="-1 -1 -1 1 -1 -1 -1 1 -1 1 1 -1 -1 -1 1 1 -1 1 -1 1 1 1 1 1" scale="0.1 0.1 0.1"/>
-  </asset>
-  <worldbody>
-    <light pos="0 0 3" castshadow="false"/>
-    <camera name="agentview" pos="0 0 2"/>
-    <camera name="side" pos="0 -2 0.1" xyaxes="1 0 0 0 0 1"/>
-    <geom name="floor" type="plane" size="2 2 0.1" rgba="0.5 0.5 0.5 1" group="1"/>
-    <body name="box_1_main" pos="0.3 0.1 0.1">
-      <freejoint/>
-      <geom name="box_1_g0" type="mesh" mesh="cube" rgba="0.8 0.8 0.8 1" group="1"/>
-      <geom name="box_1_g1" type="box" size="0.3 0.3 0.3" group="0"/>
-    </body>
-    <body name="ball_1_main" pos="-0.3 -0.2 0.1">
-      <freejoint/>
-      <geom name="ball_1_g0" type="sphere" size="0.1" material="cloth" group="1"/>
-    </body>
-    <body name="robot0_base"><geom type="sphere" size="0.05" pos="0 0.5 0" rgba="1 1 1 1" group="1"/></body>
-  </worldbody>
-</mujoco>
-"""
-SIZE = 48
 
 pytestmark = needs_gl
-
-
-def tiny_scene() -> Scene:
-    def entity(name: str) -> Entity:
-        return Entity(
-            name=name,
-            category=name.removesuffix("_1"),
-            fixture=False,
-            root_body=f"{name}_main",
-            joints=(),
-            contact_geoms=(),
-            bottom_z=0.0,
-            top_z=0.0,
-            radius=0.0,
-        )
-
-    return Scene(
-        problem_name="tiny",
-        model=mujoco.MjModel.from_xml_string(XML),
-        arena=ARENAS["libero_floor_manipulation"],
-        entities=MappingProxyType({name: entity(name) for name in ("box_1", "ball_1")}),
-        regions=MappingProxyType({}),
-    )
-
-
-@pytest.fixture(scope="module")
-def stage() -> Stage:
-    return Stage(tiny_scene())
-
-
-@pytest.fixture
-def renderer(stage: Stage) -> Iterator[GlRenderer]:
-    made = GlRenderer([stage], height=SIZE, width=SIZE, num_threads=2)
-    yield made
-    made.close()
-
-
-def shot(stage: Stage, *, box: tuple[float, float] = (0.3, 0.1), options: VisualOptions | None = None) -> Shot:
-    model = stage.model
-    qpos = model.qpos0.copy()
-    qpos[:2] = box
-    return Shot(0, Pose(qpos, model.body_pos.copy(), model.body_quat.copy()), options or VisualOptions())
-
-
-def rgb(renderer: GlRenderer, *shots: Shot, camera: str | UserCamera = "agentview") -> np.ndarray:
-    frames = renderer.render(shots, [camera])
-    return frames.rgb[camera if isinstance(camera, str) else camera.name]
-
 
 ALL = Wanted(rgb=True, depth=True, segmentation=True)
 
@@ -123,11 +39,11 @@ def test_every_slot_and_camera_gets_its_images(renderer: GlRenderer, stage: Stag
         assert frames.depth[camera].shape == frames.segmentation[camera].shape == (3, SIZE, SIZE)
     masks = frames.segmentation["agentview"] == stage.instances.index("box_1")
     columns = [np.flatnonzero(mask.any(axis=0)).mean() for mask in masks]
-    # The picture is mirrored: what lies to the camera's right is on the left.
+    # The image is mirrored: what lies to the camera's right is on the left.
     assert columns[0] > columns[1] > columns[2]
 
 
-def test_pictures_do_not_depend_on_threads_or_neighbours(renderer: GlRenderer, stage: Stage) -> None:
+def test_images_do_not_depend_on_threads_or_neighbours(renderer: GlRenderer, stage: Stage) -> None:
     shots = [shot(stage, box=(0.1 * i, 0.0)) for i in range(5)]
     together = rgb(renderer, *shots)
     alone = GlRenderer([stage], height=SIZE, width=SIZE, num_threads=1)
@@ -186,16 +102,16 @@ def test_collision_geoms_are_not_drawn(renderer: GlRenderer, stage: Stage) -> No
 
 
 def test_what_no_camera_sees_is_left_out_and_nothing_else(stage: Stage) -> None:
-    """Culling: wherever the box goes, its picture is the one with everything drawn."""
+    """Culling: wherever the box goes, its image is the one with everything drawn."""
     rng = np.random.default_rng(0)
     poses = [shot(stage, box=tuple(rng.uniform(-1.2, 1.2, 2))) for _ in range(40)]
     culled, whole = GlRenderer([stage], height=SIZE, width=SIZE), GlRenderer([stage], height=SIZE, width=SIZE)
     try:
-        pictures = rgb(culled, *poses)
+        images = rgb(culled, *poses)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(stage, "_always", np.ones(stage.model.ngeom, bool))
-            np.testing.assert_array_equal(rgb(whole, *poses), pictures)
-        assert len(np.unique(pictures.reshape(40, -1), axis=0)) > 10
+            np.testing.assert_array_equal(rgb(whole, *poses), images)
+        assert len(np.unique(images.reshape(40, -1), axis=0)) > 10
     finally:
         culled.close()
         whole.close()
@@ -222,7 +138,7 @@ MIRRORED = """
 
 
 @pytest.mark.parametrize(("kind", "size"), [("plane", "0.4 0.4 0.1"), ("plane", "0 0 0.1"), ("box", "0.4 0.4 0.02")])
-def test_a_mirror_shows_what_the_picture_does_not(kind: str, size: str) -> None:
+def test_a_mirror_shows_what_the_image_does_not(kind: str, size: str) -> None:
     scene = dataclasses.replace(
         tiny_scene(), model=mujoco.MjModel.from_xml_string(MIRRORED.format(kind=kind, size=size))
     )
@@ -235,14 +151,14 @@ def test_a_mirror_shows_what_the_picture_does_not(kind: str, size: str) -> None:
         shots.append(Shot(0, Pose(qpos, model.body_pos.copy(), model.body_quat.copy())))
     culled, whole = GlRenderer([stage], height=SIZE, width=SIZE), GlRenderer([stage], height=SIZE, width=SIZE)
     try:
-        pictures = rgb(culled, *shots)
+        images = rgb(culled, *shots)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(stage, "_always", np.ones(model.ngeom, bool))
-            np.testing.assert_array_equal(rgb(whole, *shots), pictures)
+            np.testing.assert_array_equal(rgb(whole, *shots), images)
         with pytest.MonkeyPatch.context() as patch:
             # The first is in the mirror only.
             patch.setattr(stage._mirrors, "cones", lambda *_: iter(()))
-            assert (rgb(whole, shots[0]) != pictures[0]).any()
+            assert (rgb(whole, shots[0]) != images[0]).any()
     finally:
         culled.close()
         whole.close()
@@ -253,7 +169,7 @@ def test_the_sky_is_left_out_only_where_the_floor_hides_it(stage: Stage) -> None
     down, level = (stage.view(name, pose, VisualOptions(), 0) for name in ("agentview", "side"))
     assert stage._walls.fill(stage._data, down, 1.0)
     assert not stage._walls.fill(stage._data, level, 1.0)
-    assert not stage._walls.fill(stage._data, down, 3.0)  # so wide a picture shows what is beside the floor
+    assert not stage._walls.fill(stage._data, down, 3.0)  # so wide an image shows what is beside the floor
     below = UserCamera.looking_at("below", eye=[0, 0, -2], target=[0, 0, 0], up=[1, 0, 0])
     assert not stage._walls.fill(stage._data, stage.view(below, pose, VisualOptions(), 0), 1.0)
 
@@ -346,10 +262,10 @@ def _grown(mask: np.ndarray) -> np.ndarray:
 def test_textures_are_swapped_in_one_slot_only(renderer: GlRenderer, stage: Stage) -> None:
     swapped = shot(stage, options=VisualOptions(textures={"cloth": "checks"}))
     plain = shot(stage)
-    pictures = rgb(renderer, plain, swapped, plain, swapped, plain)
-    np.testing.assert_array_equal(pictures[0], pictures[2])
-    np.testing.assert_array_equal(pictures[0], pictures[4])
-    assert (pictures[1] != pictures[0]).any()
+    images = rgb(renderer, plain, swapped, plain, swapped, plain)
+    np.testing.assert_array_equal(images[0], images[2])
+    np.testing.assert_array_equal(images[0], images[4])
+    assert (images[1] != images[0]).any()
 
 
 def test_cameras_are_shifted_in_their_own_frame(renderer: GlRenderer, stage: Stage) -> None:
@@ -376,129 +292,3 @@ def test_variation_depends_on_the_seed_alone() -> None:
     assert variation.draw((3, 1)) == variation.draw((3, 1))
     assert variation.draw((3, 1)) != variation.draw((3, 2))
     assert VisualVariation(cameras=()).draw(0) == VisualOptions()
-
-
-# -- GL missing, failing, running out ---------------------------------------------------------------------------------
-
-
-def test_without_gl_libraries_the_error_names_the_packages(monkeypatch: pytest.MonkeyPatch, stage: Stage) -> None:
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(gl, "_loads", lambda library: False)
-    with pytest.raises(GlError, match=r"libegl1.*libosmesa6.*Physics does not need it"):
-        GlRenderer([stage])
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    with pytest.raises(GlError, match=r"libOSMesa is not installed; apt-get install libosmesa6"):
-        GlRenderer([stage])
-
-
-def test_an_unknown_gl_is_refused(stage: Stage) -> None:
-    with pytest.raises(GlError, match="gl='vulkan': expected one of egl, osmesa"):
-        GlRenderer([stage], gl="vulkan")
-
-
-def test_a_driver_that_refuses_is_named(monkeypatch: pytest.MonkeyPatch, stage: Stage) -> None:
-    def refuse(*_: Any) -> Any:
-        raise RuntimeError("no device")
-
-    monkeypatch.setattr("importlib.import_module", refuse)
-    with pytest.raises(GlError, match=r"gives no GL context \(RuntimeError: no device\).*vecenv doctor"):
-        GlRenderer([stage], num_threads=1)
-
-
-def test_fewer_contexts_than_threads_are_enough(monkeypatch: pytest.MonkeyPatch, stage: Stage) -> None:
-    opened, real = [], gl.open_context
-
-    def scarce(*arguments: Any) -> Any:
-        if len(opened) == 2:
-            raise GlError("no more contexts")
-        opened.append(arguments)
-        return real(*arguments)
-
-    monkeypatch.setattr(gl, "open_context", scarce)
-    renderer = GlRenderer([stage], height=SIZE, width=SIZE, num_threads=5)
-    try:
-        assert renderer.num_threads == 2
-        assert rgb(renderer, *[shot(stage)] * 7).any(axis=(1, 2, 3)).all()
-    finally:
-        renderer.close()
-
-
-def test_a_lost_context_is_made_anew(monkeypatch: pytest.MonkeyPatch, renderer: GlRenderer, stage: Stage) -> None:
-    before, failures = rgb(renderer, shot(stage)), [0x507]
-    real = mujoco.mjr_getError
-    monkeypatch.setattr(mujoco, "mjr_getError", lambda: failures.pop() if failures else real())
-    np.testing.assert_array_equal(rgb(renderer, shot(stage)), before)
-    assert not failures
-
-
-def test_gl_that_keeps_failing_is_an_error(monkeypatch: pytest.MonkeyPatch, renderer: GlRenderer, stage: Stage) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(mujoco, "mjr_getError", lambda: 0x507)
-        with pytest.raises(GlError, match="fails again and again"):
-            rgb(renderer, shot(stage), shot(stage))
-    assert rgb(renderer, shot(stage)).any()
-
-
-def test_a_closed_renderer_says_so(stage: Stage) -> None:
-    renderer = GlRenderer([stage], height=SIZE, width=SIZE, num_threads=1)
-    renderer.close()
-    renderer.close()
-    with pytest.raises(GlError, match="closed"):
-        rgb(renderer, shot(stage))
-
-
-def test_several_threads_may_ask_at_once(renderer: GlRenderer, stage: Stage) -> None:
-    expected = rgb(renderer, shot(stage))
-    seen: list[np.ndarray] = []
-    askers = [threading.Thread(target=lambda: seen.append(rgb(renderer, shot(stage)))) for _ in range(4)]
-    for asker in askers:
-        asker.start()
-    for asker in askers:
-        asker.join()
-    assert len(seen) == 4
-    assert all(np.array_equal(picture, expected) for picture in seen)
-
-
-def test_closing_ends_the_threads(stage: Stage) -> None:
-    before = threading.active_count()
-    for _ in range(20):
-        renderer = GlRenderer([stage], height=SIZE, width=SIZE, num_threads=2)
-        rgb(renderer, shot(stage))
-        renderer.close()
-    assert threading.active_count() == before
-
-
-@pytest.mark.heavy
-def test_hundreds_of_renderers_leak_nothing(stage: Stage) -> None:
-    def cycles(count: int) -> float:
-        for _ in range(count):
-            renderer = GlRenderer([stage], height=SIZE, width=SIZE, num_threads=2)
-            rgb(renderer, shot(stage), shot(stage))
-            renderer.close()
-        ctypes.CDLL("libc.so.6").malloc_trim(0)  # what is free goes back, or its pieces look like a leak
-        status = Path("/proc/self/status").read_text()
-        return int(status.split("VmRSS:")[1].split()[0]) / 1024
-
-    warm = cycles(50)
-    after = cycles(300)
-    print(f"{warm:.1f} MB after 50 cycles, {after:.1f} MB after 350")
-    # 27 kB a renderer; an image of it that stayed would be more, its context megabytes.
-    assert after - warm < 8
-
-
-def test_every_other_context_in_software_gl_is_on_a_second_display() -> None:
-    if not available() or choose() != "egl":
-        pytest.skip("GL is not EGL here")
-    from mujoco import egl
-
-    from vecenv.libero.render import displays
-
-    before = dict(os.environ)
-    contexts = [displays.egl_context(8, 8) for _ in range(2)]
-    assert dict(os.environ) == before
-    kinds = {isinstance(context, egl.GLContext) for context in contexts}
-    assert kinds == ({True, False} if displays._is_software(egl.EGL_DISPLAY) else {True})
-    for context in contexts:
-        context.make_current()
-        context.free()
-        context.free()

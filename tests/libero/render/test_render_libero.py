@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from support.pictures import needs_gl
+from support.images import needs_gl
 
 import vecenv
 from vecenv.contract import Egocentric, ImagesUnavailable
@@ -54,7 +54,7 @@ def test_policies_get_their_two_images(env: LiberoEnv) -> None:
     assert (first[0] != first[1]).any()
 
 
-def test_the_picture_is_upright(env: LiberoEnv) -> None:
+def test_the_image_is_upright(env: LiberoEnv) -> None:
     """The robot stands at the far end of the floor, so its base is seen in the upper half."""
     seen = env.observe_egocentric()
     rows = np.nonzero(seen.segmentation[0] == seen.instances[0].index("robot"))[0]
@@ -81,12 +81,12 @@ def test_only_what_is_read_is_rendered(env: LiberoEnv, monkeypatch: pytest.Monke
     assert asked[2:] == [(["agentview", "wrist"], gl.Wanted(rgb=True))]
 
 
-def test_pictures_stay_those_of_their_moment(env: LiberoEnv) -> None:
+def test_images_stay_those_of_their_moment(env: LiberoEnv) -> None:
     early, again = env.observe_egocentric(), env.observe_egocentric()
-    picture = early.rgb
+    image = early.rgb
     moved(env)
-    np.testing.assert_array_equal(again.rgb, picture)
-    assert (env.observe_egocentric().rgb != picture).any()
+    np.testing.assert_array_equal(again.rgb, image)
+    assert (env.observe_egocentric().rgb != image).any()
 
 
 def test_a_finished_slot_shows_its_last_frame(env: LiberoEnv) -> None:
@@ -158,7 +158,7 @@ def test_a_camera_of_a_taken_name_is_refused() -> None:
     env = vecenv.make("libero_object", task=0, episodes=[0], render=render)
     try:
         env.reset()
-        with pytest.raises(RenderError, match="'agentview' already"):
+        with pytest.raises(RenderError, match="already has a camera 'agentview'"):
             env.observe_egocentric()
     finally:
         env.close()
@@ -183,8 +183,8 @@ def test_after_closing_only_what_was_read_is_there() -> None:
     env = vecenv.make("libero_object", task=0, episodes=[0])
     env.reset()
     seen: Egocentric = env.observe_egocentric()
-    picture = seen.rgb
+    image = seen.rgb
     env.close()
-    assert seen.rgb is picture
+    assert seen.rgb is image
     with pytest.raises(GlError, match="closed"):
         _ = seen.wrist_image

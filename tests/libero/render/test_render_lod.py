@@ -1,4 +1,4 @@
-"""Levels of detail: fewer triangles, the same corners, and pictures close to those of all triangles, upstream's."""
+"""Levels of detail: fewer triangles, the same corners, and images close to those of all triangles, upstream's."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from support import upstream
-from support.pictures import needs_gl, psnr, ssim
+from support.images import needs_gl, psnr, ssim
 
 import vecenv
 from vecenv.libero.render import lod
@@ -61,21 +61,21 @@ def test_an_unknown_mesh_stays_as_it_is() -> None:
     np.testing.assert_array_equal(model.mesh_face, face)
 
 
-def pictures_of(level: str, suite: str, task: int, episodes: list[int]) -> np.ndarray:
+def images_of(level: str, suite: str, task: int, episodes: list[int]) -> np.ndarray:
     """Both cameras after ten random actions, uint8 [2 * episodes, 256, 256, 3]."""
     env = vecenv.make(suite, task=task, episodes=episodes, render=RenderConfig(lod=level))
     env.reset()
     for tick in np.random.default_rng(task).uniform(-1, 1, (10, len(episodes), 7)):
         env.step_continuous(tick)
-    pictures = np.concatenate(env.observe_egocentric().observation)
+    images = np.concatenate(env.observe_egocentric().observation)
     env.close()
-    return pictures
+    return images
 
 
 def compare(suite: str, task: int, episodes: list[int]) -> None:
-    whole = pictures_of("original", suite, task, episodes)
+    whole = images_of("original", suite, task, episodes)
     for level, (least_psnr, least_ssim) in LEAST.items():
-        found = pictures_of(level, suite, task, episodes)
+        found = images_of(level, suite, task, episodes)
         ratios = [psnr(a, b) for a, b in zip(whole, found, strict=True)]
         likeness = [ssim(a, b) for a, b in zip(whole, found, strict=True)]
         print(f"{suite} {task} {level}: at least {min(ratios):.1f} dB, SSIM {min(likeness):.3f}")
@@ -84,13 +84,13 @@ def compare(suite: str, task: int, episodes: list[int]) -> None:
 
 
 @needs_gl
-def test_simplified_pictures_are_close_to_upstreams() -> None:
+def test_simplified_images_are_close_to_upstreams() -> None:
     compare("libero_object", 0, [0, 7])
 
 
 @needs_gl
 @pytest.mark.heavy
 @pytest.mark.parametrize("scene_id", upstream.scene_ids())
-def test_simplified_pictures_are_close_in_every_scene(scene_id: str) -> None:
+def test_simplified_images_are_close_in_every_scene(scene_id: str) -> None:
     suite, task = scene_id.rsplit("-", 1)
     compare(suite, int(task), [0, 14, 28])

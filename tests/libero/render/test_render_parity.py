@@ -1,4 +1,4 @@
-"""Pictures are upstream's: the same state seen through the same cameras by LIBERO's ``OffScreenRenderEnv``.
+"""Images are upstream's: the same state seen through the same cameras by LIBERO's ``OffScreenRenderEnv``.
 
 The peer renders with images switched on, in the GL that vecenv draws with; its observations, turned by 180 degrees as
 VLA evaluations turn them, are compared with what ``observe_egocentric`` delivers. It runs on the installed MuJoCo, so
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support import upstream
-from support.pictures import needs_gl, psnr
+from support.images import needs_gl, psnr
 
 import vecenv
 from vecenv.contract import Egocentric
@@ -24,7 +24,7 @@ from vecenv.libero.render.options import RenderConfig
 pytestmark = needs_gl
 
 CAMERAS = {"agentview": "agentview_image", "wrist": "robot0_eye_in_hand_image"}
-# What the project promises. With every triangle, pictures are equal to the bit, nearly all of them.
+# What the project promises. With every triangle, images are equal to the bit, nearly all of them.
 ENOUGH = {"exact": 45.0, "original": 60.0}
 
 
@@ -52,7 +52,7 @@ def agreement(ours: Egocentric, theirs: dict[str, Any]) -> float:
 
 
 @pytest.mark.parametrize("level", list(ENOUGH))
-def test_pictures_of_a_rollout_are_upstreams(level: str) -> None:
+def test_images_of_a_rollout_are_upstreams(level: str) -> None:
     """The start, and frames in motion: upstream samples them within the 24th of 25 substeps."""
     rng = np.random.default_rng(0)
     with pair("libero_goal", 7, 2, level) as (peer, seen, env):
@@ -66,7 +66,7 @@ def test_pictures_of_a_rollout_are_upstreams(level: str) -> None:
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("scene_id", upstream.scene_ids())
-def test_pictures_of_every_scene_are_upstreams(scene_id: str) -> None:
+def test_images_of_every_scene_are_upstreams(scene_id: str) -> None:
     """Four states a scene, 128 in all: the start, two in motion, and one with every joint somewhere else."""
     suite, task = scene_id.rsplit("-", 1)
     rng = np.random.default_rng(int(task))

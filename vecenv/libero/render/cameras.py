@@ -1,8 +1,8 @@
-"""Between an environment and its renderer: what the cameras of a batch saw at one moment, rendered when it is read.
+"""The cameras of a batch: they capture the poses of one moment, and render images of it when an image is read.
 
-In: the physics groups of a batch and the problem each of them runs. Out: the image mappings of ``Egocentric``. A moment
-copies the poses it needs, so its pictures stay those of the moment however the batch moves on; nothing is compiled,
-uploaded or drawn before a picture is read. Without a picture read, no GL library is ever loaded.
+In: the physics groups of a batch and the problem that each of them runs. Out: the image mappings of ``Egocentric``. A
+capture copies the poses it needs, so its images do not change when the batch moves on. Nothing is compiled, uploaded or
+drawn before an image is read, and no GL library is loaded before that.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from __future__ import annotations
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import mujoco
+import numpy as np
 
 from vecenv.contract import CameraView, Rendered
 from vecenv.libero.physics.base import Group
@@ -21,20 +22,24 @@ from vecenv.libero.render.colors import visual_scene
 from vecenv.libero.render.drawing import ROBOT, Pose, Stage, camera_view
 from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
-from vecenv.libero.scene.bddl import Problem
+from vecenv.libero.scene.bddl import Problem, SceneKey
 
 if TYPE_CHECKING:
     from vecenv.libero.render.raytrace import RayRenderer
 
-# Stages that stay compiled after the last environment that used them is closed; one takes 0.9 GB.
+_StageKey = tuple[SceneKey, str, str]
+# How many stages stay compiled after the last environment that used them is closed; one takes 0.9 GB.
 _KEPT = 1
-_stages: weakref.WeakValueDictionary[tuple, Stage] = weakref.WeakValueDictionary()
-_kept: OrderedDict[tuple, Stage] = OrderedDict()
+_stages: weakref.WeakValueDictionary[_StageKey, Stage] = weakref.WeakValueDictionary()
+_kept: OrderedDict[_StageKey, Stage] = OrderedDict()
 _compiling = threading.Lock()
 
 
 def stage_of(problem: Problem, physics: mujoco.MjModel, level: str, colors: str) -> Stage:
-    """The stage of a problem's scene, compiled (seconds) unless it is in use or was lately; errors of compile_scene."""
+    """The stage of a problem's scene; errors are those of ``compile_scene``.
+
+    Compiling takes seconds. A stage is reused while an environment uses it, and the last one used is kept.
+    """
     key = (problem.scene_key(), level, colors)
     with _compiling:
         stage = _stages.get(key)
@@ -50,7 +55,7 @@ def stage_of(problem: Problem, physics: mujoco.MjModel, level: str, colors: str)
     return stage
 
 
-class Eyes:
+class CameraRig:
     """The cameras of a batch.
 
     Args:
@@ -66,24 +71,24 @@ class Eyes:
         self._stages: list[Stage] = []
         self._closed = False
 
-    def look(self, groups: Sequence[Group], problems: Sequence[Problem]) -> Moment:
-        """What there is to see now; ``problems`` has one of each group."""
-        return Moment(self, groups, problems)
+    def capture(self, groups: Sequence[Group], problems: Sequence[Problem]) -> Capture:
+        """Capture the poses of now; ``problems`` has one for each group."""
+        return Capture(self, groups, problems)
 
     def stages(self, problems: Sequence[Problem], models: Sequence[mujoco.MjModel]) -> list[Stage]:
-        """The stages of these problems, whose physics models these are; they are kept until others are asked for.
+        """The stages of these problems, one physics model for each; they are kept until others are requested.
 
         Raises:
             GlError: the environment is closed.
         """
         if self._closed:
-            raise GlError("the environment is closed: pictures must be read before")
+            raise GlError("the environment is closed: images must be read before")
         pairs = zip(problems, models, strict=True)
         self._stages = [stage_of(problem, model, self.config.lod, self.config.colors) for problem, model in pairs]
         return self._stages
 
     def renderer(self, stages: Sequence[Stage]) -> GlRenderer:
-        """A renderer of these stages, kept until others are asked for.
+        """A renderer of these stages, kept until others are requested.
 
         Raises:
             GlError: there is no GL.
@@ -106,15 +111,15 @@ class Eyes:
             GlError: the environment is closed.
         """
         if self._closed:
-            raise GlError("the environment is closed: pictures must be read before")
+            raise GlError("the environment is closed: images must be read before")
         if self._rays is None:
-            from vecenv.libero.render.raytrace import RayRenderer  # imports JAX
+            from vecenv.libero.render.raytrace import RayRenderer  # needs the extra `warp`
 
             self._rays = RayRenderer(self.config)
         return self._rays
 
     def close(self) -> None:
-        """Free what GL holds. Closing twice is harmless."""
+        """Free the GL resources. Closing twice is harmless."""
         self._closed, self._rays = True, None
         self._drop()
         self._stages = []
@@ -125,28 +130,32 @@ class Eyes:
         self._renderer = None
 
 
-class Moment:
-    """What the cameras of a batch see at one moment.
+class Capture:
+    """The images of a batch at one moment.
 
     Attributes:
-        images, depths, segmentations, views: by camera, made when they are read.
-        instances: what can be seen in each slot.
+        images: uint8 [B, H, W, 3] by camera, rendered when read; so are all mappings here.
+        depths: metres from the camera's plane, float32 [B, H, W] by camera.
+        segmentations: indices into ``instances``, int16 [B, H, W] by camera.
+        views: the intrinsics and poses of each camera.
+        instances: by slot, the names that segmentation images index.
     """
 
-    def __init__(self, eyes: Eyes, groups: Sequence[Group], problems: Sequence[Problem]) -> None:
-        self._eyes, self._problems = eyes, tuple(problems)
+    def __init__(self, rig: CameraRig, groups: Sequence[Group], problems: Sequence[Problem]) -> None:
+        self._rig, self._problems = rig, tuple(problems)
         self._models = [group.scene.model for group in groups]
         count = sum(len(group.slots) for group in groups)
-        self._shots: list[Any] = [None] * count
+        shots: dict[int, Shot] = {}
         instances: list[tuple[str, ...]] = [()] * count
         for index, group in enumerate(groups):
             pos, quat = group.expand("body_pos"), group.expand("body_quat")
             qpos = group.seen_qpos.copy()
             for row, slot in enumerate(group.slots.tolist()):
-                self._shots[slot] = Shot(index, Pose(qpos[row], pos[row], quat[row]), eyes.options[slot])
+                shots[slot] = Shot(index, Pose(qpos[row], pos[row], quat[row]), rig.options[slot])
                 instances[slot] = ("", ROBOT, *group.scene.entities)
+        self._shots = [shots[slot] for slot in range(count)]
         self.instances = tuple(instances)
-        names = _camera_names(self._models, eyes.config.cameras)
+        names = _camera_names(self._models, rig.config.cameras)
         self.images = Rendered(names, self._rendering(Wanted(), lambda frames: frames.rgb))
         self.depths = Rendered(names, self._rendering(Wanted(rgb=False, depth=True), lambda frames: frames.depth))
         self.segmentations = Rendered(
@@ -154,18 +163,20 @@ class Moment:
         )
         self.views = Rendered(names, self._views)
 
-    def _rendering(self, wanted: Wanted, pick: Callable[[Frames], Any]) -> Callable[[Sequence[str]], Any]:
-        def render(names: Sequence[str]) -> Any:
-            if self._eyes.config.engine == "raytrace":
-                rays = self._eyes.rays()
+    def _rendering(
+        self, wanted: Wanted, pick: Callable[[Frames], Mapping[str, np.ndarray]]
+    ) -> Callable[[Sequence[str]], Mapping[str, np.ndarray]]:
+        def render(names: Sequence[str]) -> Mapping[str, np.ndarray]:
+            if self._rig.config.engine == "raytrace":
+                rays = self._rig.rays()
                 return pick(rays.render(self._shots, self._problems, self._models, names, wanted))
-            renderer = self._eyes.renderer(self._eyes.stages(self._problems, self._models))
+            renderer = self._rig.renderer(self._rig.stages(self._problems, self._models))
             return pick(renderer.render(self._shots, self._cameras(names), wanted))
 
         return render
 
     def _views(self, names: Sequence[str]) -> dict[str, CameraView]:
-        stages, config = self._eyes.stages(self._problems, self._models), self._eyes.config
+        stages, config = self._rig.stages(self._problems, self._models), self._rig.config
         return {
             name: camera_view(
                 [
@@ -179,28 +190,28 @@ class Moment:
         }
 
     def _cameras(self, names: Sequence[str]) -> list[str | UserCamera]:
-        own = {camera.name: camera for camera in self._eyes.config.cameras}
-        return [own.get(name, name) for name in names]
+        given = {camera.name: camera for camera in self._rig.config.cameras}
+        return [given.get(name, name) for name in names]
 
 
-def _camera_names(models: Sequence[mujoco.MjModel], own: Sequence[UserCamera]) -> tuple[str, ...]:
-    """The user cameras, the cameras that all scenes have, and their other names."""
+def _camera_names(models: Sequence[mujoco.MjModel], given: Sequence[UserCamera]) -> tuple[str, ...]:
+    """The cameras that all scenes have, their aliases, and the user cameras."""
     shared = [{model.camera(index).name for index in range(model.ncam)} for model in models]
     scene = [
         name for name in (models[0].camera(i).name for i in range(models[0].ncam)) if all(name in s for s in shared)
     ]
     aliases = [alias for alias, real in ALIASES.items() if real in scene]
-    for camera in own:
+    for camera in given:
         if camera.name in (*scene, *aliases):
-            raise RenderError(f"the scene has a camera {camera.name!r} already")
-    return (*scene, *aliases, *(camera.name for camera in own))
+            raise RenderError(f"the scene already has a camera {camera.name!r}")
+    return (*scene, *aliases, *(camera.name for camera in given))
 
 
 def options_of(given: VisualOptions | Sequence[VisualOptions], num_envs: int) -> list[VisualOptions]:
-    """One option a slot, of one for all or of B.
+    """One visual option for each slot, from one for all or from B of them.
 
     Raises:
-        RenderError: not as many as slots.
+        RenderError: the number of options is not the number of slots.
     """
     options = [given] * num_envs if isinstance(given, VisualOptions) else list(given)
     if len(options) != num_envs:

@@ -1,6 +1,6 @@
-"""Textures as LIBERO was published with, on a MuJoCo that shows them otherwise.
+"""Textures as MuJoCo showed them when LIBERO was published; newer versions of MuJoCo show them differently.
 
-In: a problem. Out: its scene compiled with what is drawn. With ``"published"`` pictures are those of MuJoCo 3.3.0, and
+In: a problem. Out: its scene compiled with visual meshes. With ``"published"`` images are those of MuJoCo 3.3.0, and
 up to 3.3.2, under which LIBERO's demonstrations were rendered and its checkpoints scored; with ``"current"`` those of
 the installed MuJoCo. What differs:
 
@@ -8,9 +8,9 @@ the installed MuJoCo. What differs:
   workspaces and two maps of a bottle. The changelog's remedy is ``colorspace="linear"``, which is what is done here.
 * Since 3.12.0, boxes have texture coordinates of their own. Before, two-dimensional textures were projected along z,
   with the texture's corner in another place: LIBERO's walls, the sides of its stove, a cloth. Such boxes get a skin, a
-  mesh just outside the faces that look different, with the coordinates of then. Finite planes changed likewise; those
+  mesh just outside the faces that look different, with the earlier coordinates. Finite planes changed likewise; those
   of LIBERO, whose textures repeat a whole number of times, look the same. It has no other shapes with such textures.
-* A mesh without texture coordinates wears its texture along the axes of its inertia. The stove's burner plate is round,
+* A mesh without texture coordinates has its texture along the axes of its inertia. The stove's burner plate is round,
   so it has no particular ones, and what MuJoCo makes of it differs between versions. It is turned to those of 3.3.0.
 
 Physics never sees any of this.
@@ -29,9 +29,9 @@ from vecenv.libero.render.options import check_colors, matrix_of, quat_of
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.scene import Scene, scene_source
 
-# How mesh and geom of a skin are named, before the name or number of the box.
+# Prefix of the names of a skin's mesh and geom; the name or number of the box follows.
 SKIN = "published_skin:"
-# How far outside the box a skin is, metres: more than depth buffers confuse, less than can be seen.
+# How far outside the box a skin is, metres: more than depth buffers confuse, less than is visible.
 _GAP = 2e-6
 # Meshes by the end of their name, and the orientation (wxyz, in the mesh's file) that MuJoCo 3.3.0 gives their frame.
 _FRAMES = {"burnerplate": (0.2580847, 0.65832536, -0.2580847, 0.65832536)}
@@ -48,11 +48,11 @@ def visual_scene(problem: Problem, colors: str, level: str = "original") -> Scen
 
     Raises:
         RenderError: ``colors`` is neither.
-        SceneError: as ``compile_scene`` does.
+        SceneError: as ``compile_scene`` raises.
     """
     check_colors(colors)
     scene = scene_source(problem, visual=True).compile(_add_skins if colors == "published" else None)
-    lod.simplify(scene.model, level)  # knows meshes by their content, so before any is changed
+    lod.simplify(scene.model, level)  # finds meshes by their content, so it comes before any is changed
     set_decoding(scene.model, colors)
     if colors == "published":
         _undo_repetition(scene.model)
@@ -64,7 +64,7 @@ def visual_scene(problem: Problem, colors: str, level: str = "original") -> Scen
 
 
 def set_decoding(model: mujoco.MjModel, colors: str) -> None:
-    """Have the textures of a compiled model decoded as is asked for: none of them before MuJoCo 3.3.3.
+    """Set how the textures of a compiled model are decoded; MuJoCo before 3.3.3 decoded none.
 
     Raises:
         RenderError: ``colors`` is neither ``"published"`` nor ``"current"``.
@@ -82,7 +82,7 @@ def _add_skins(spec: mujoco.MjSpec) -> None:
 
 
 def _scale(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> np.ndarray | None:
-    """How often a geom's two-dimensional texture repeats along x and y, [2]; None without such a texture."""
+    """How often a geom's two-dimensional texture repeats along x and y, [2]; None if it has none."""
     material = spec.material(geom.material) if geom.material else None
     texture = spec.texture(material.textures[_RGB]) if material and material.textures[_RGB] else None
     if material is None or texture is None or texture.type != mujoco.mjtTexture.mjTEXTURE_2D:
@@ -130,7 +130,7 @@ def _face(axis: int, sign: int, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _undo_repetition(model: mujoco.MjModel) -> None:
-    """Divide the texture coordinates of skins by what GL multiplies those of meshes with, which is in them already."""
+    """Divide the texture coordinates of skins by the repetition, which GL multiplies those of meshes with."""
     for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
         if model.geom(geom).name.startswith(SKIN):
             mesh, material = int(model.geom_dataid[geom]), int(model.geom_matid[geom])
@@ -141,7 +141,7 @@ def _undo_repetition(model: mujoco.MjModel) -> None:
 
 
 def _set_frame(model: mujoco.MjModel, mesh: int, quat: Sequence[float]) -> None:
-    """Turn the frame of a mesh, which looks the same but for the texture that is projected on it."""
+    """Rotate the frame of a mesh. Only the texture that is projected on it looks different afterwards."""
     turn = matrix_of(np.asarray(quat)).T @ matrix_of(model.mesh_quat[mesh])
     shape = lod.Mesh.of(model, mesh)
     shape.vert[:], shape.normal[:] = shape.vert @ turn.T, shape.normal @ turn.T

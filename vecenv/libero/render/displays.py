@@ -1,8 +1,8 @@
-"""EGL contexts that draw beside each other in Mesa's software GL.
+"""EGL contexts that draw in parallel in Mesa's software GL.
 
-llvmpipe fills triangles for one context of a display at a time, whatever thread it is of: two threads then keep 1.2
-cores busy (``LP_NUM_THREADS=0``) to 1.6. A context on another display does not wait. In: nothing. Out: contexts like
-MuJoCo's; where GL is Mesa's software, every other one is on a second display. Pictures are the same.
+llvmpipe fills triangles for one context of a display at a time, whichever thread uses it: two threads then keep 1.2
+(``LP_NUM_THREADS=0``) to 1.6 cores busy. A context on another display does not wait. Out: contexts with the methods of
+MuJoCo's; with Mesa's software GL, every other one is on a second display. The images are the same.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import itertools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 from vecenv.util.cores import usable_cores
 
@@ -24,22 +24,22 @@ _THREADS = "LP_NUM_THREADS"
 _numbers = itertools.count()
 
 
-def egl_context(width: int, height: int) -> Any:
-    """A new ``mujoco.egl.GLContext``, or one that is like it; one thread at a time may ask."""
+def egl_context(width: int, height: int) -> GlContext:
+    """A new EGL context; not thread-safe."""
     from mujoco import egl
 
     second = next(_numbers) % 2 == 1
     with _shared_cores():
-        # MuJoCo makes its display with its first context.
+        # MuJoCo opens its display with its first context.
         display = _second_display() if second and egl.EGL_DISPLAY is not None else None
         return egl.GLContext(width, height) if display is None else _Context(display)
 
 
 @contextmanager
 def _shared_cores() -> Iterator[None]:
-    """While a display is made: the threads that Mesa fills triangles with, its share of the cores.
+    """While a display is opened, set the number of threads that Mesa fills triangles with to its share of the cores.
 
-    With one or two cores none: the thread that draws does it. What the user says about it counts.
+    With one or two cores there are none: the drawing thread fills them. A value set by the user is kept.
     """
     if _THREADS in os.environ:
         yield
@@ -52,8 +52,20 @@ def _shared_cores() -> Iterator[None]:
         del os.environ[_THREADS]
 
 
+class GlContext(Protocol):
+    """A GL context, as ``mujoco.egl.GLContext`` is one."""
+
+    def make_current(self) -> None:
+        """Make it the context of this thread."""
+        ...
+
+    def free(self) -> None:
+        """Release it."""
+        ...
+
+
 class _Context:
-    """A context on a display of ours, with the methods of MuJoCo's."""
+    """A context on the second display."""
 
     def __init__(self, display: Any) -> None:
         from mujoco import egl
@@ -69,12 +81,12 @@ class _Context:
             raise RuntimeError("Cannot create an EGL context.")
 
     def make_current(self) -> None:
-        """Of this thread."""
+        """Make it the context of this thread."""
         if not self._current(self._context):
             raise RuntimeError("Failed to make the EGL context current.")
 
     def free(self) -> None:
-        """Release it; twice is harmless."""
+        """Release it. Freeing twice is harmless."""
         if self._context:
             self._current(self._egl.EGL_NO_CONTEXT)
             self._egl.eglDestroyContext(self._display, self._context)
@@ -88,7 +100,7 @@ class _Context:
 
 @functools.cache
 def _second_display() -> Any:
-    """A display of Mesa's software GL besides MuJoCo's; None where MuJoCo's is no such, or there is no other."""
+    """A second display of Mesa's software GL; None if MuJoCo's is of another driver, or there is no second one."""
     from mujoco import egl
     from OpenGL import EGL
 
@@ -110,11 +122,11 @@ def _is_software(display: Any) -> bool:
 
 
 def _procedure(name: bytes, result: Any, *arguments: Any) -> Any:
-    """A function of the EGL library that PyOpenGL has loaded, by name; None if it has no such."""
+    """A function of the EGL library that PyOpenGL has loaded, by name; None if the library lacks it."""
     from OpenGL import platform
 
     library: Any = platform.PLATFORM
-    find = library.EGL["eglGetProcAddress"]  # by [], one that PyOpenGL does not share
+    find = library.EGL["eglGetProcAddress"]  # [] gives a copy that PyOpenGL does not share
     find.restype, find.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
     address = find(name)
     return ctypes.CFUNCTYPE(result, *arguments)(address) if address else None

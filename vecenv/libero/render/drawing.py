@@ -1,8 +1,8 @@
 """From physics states to lists of things to draw: a scene's visual model, posed, seen by one camera, culled.
 
 In: the visual model of a scene and the pose of one slot. Out: a filled ``MjvScene`` that any thread's GL context can
-draw, and what the camera that sees it is. One ``Stage`` serves all threads: they take turns posing it, which takes
-well under a millisecond, and draw in parallel.
+draw, and the camera's view. One ``Stage`` serves all threads: they take turns posing it, which takes well under a
+millisecond, and draw in parallel.
 
 What is drawn is what upstream draws (robosuite 1.4.0's offscreen renderer under LIBERO): visual geoms but no collision
 geoms, no sites of the gripper, and a stove's burner while the stove is on.
@@ -27,13 +27,13 @@ from vecenv.libero.scene.scene import Entity, Scene
 
 # Groups that upstream draws: 1 holds visual geoms, 2 nothing; 0 are collision geoms. A culled geom moves to 5.
 DRAWN_GROUPS, _HIDDEN = (1, 2), 5
-# Upstream's visualisation of these is off.
+# Upstream does not draw sites of these names.
 TOOL_SITES = ("robot0_", "gripper0_")
 ROBOT = "robot"
 _ROBOT_BODIES = ("robot0_", "gripper0_", "mount0_")
-# Room for what MuJoCo adds to the model's geoms and sites.
+# Spare entries for what MuJoCo adds to the model's geoms and sites.
 _SPARE_GEOMS = 64
-# Rays a side of the grid that looks for the sky.
+# Rays per side of the grid that tests whether the sky is visible.
 _GRID = 17
 _FONT = mujoco.mjtFontScale.mjFONTSCALE_50
 
@@ -59,7 +59,7 @@ class View:
     fovy: float
 
     def shifted(self, shift: CameraShift) -> View:
-        """Moved in its own frame."""
+        """The view moved in its own frame."""
         return View(
             self.pos + self.mat @ np.asarray(shift.pos, float),
             self.mat @ rotation_of(shift.turn),
@@ -68,7 +68,7 @@ class View:
 
 
 def camera_view(views: Sequence[View], height: int, width: int) -> CameraView:
-    """What the contract says about a camera, of B slots' views."""
+    """The contract's ``CameraView`` of a camera, from the views of B slots."""
     focal = np.array([height / 2 / np.tan(np.deg2rad(view.fovy) / 2) for view in views])
     matrices = np.zeros((len(views), 3, 3))
     # Delivered images are mirrored: x grows to the camera's left.
@@ -80,15 +80,15 @@ def camera_view(views: Sequence[View], height: int, width: int) -> CameraView:
 
 
 class Stage:
-    """The visual model of a scene, which threads take turns to pose.
+    """The visual model of a scene, which threads pose in turns.
 
     Args:
-        scene: compiled with ``visual=True``; its model must not be used by anyone else.
+        scene: compiled with ``visual=True``; nothing else may use its model.
 
     Attributes:
         model: the visual model.
         cameras: names of its cameras.
-        instances: what segmentation images tell apart; "" (index 0) is everything else: table, floor, walls.
+        instances: the names that segmentation images index; "" (index 0) is everything else: table, floor, walls.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -99,8 +99,8 @@ class Stage:
         self._data = mujoco.MjData(model)
         self._lock = threading.Lock()
         self._groups, self._shine = model.geom_group.copy(), model.mat_reflectance.copy()
-        # Only meshes are left out when they are out of sight. Other shapes have few triangles, and Mesa's software
-        # driver sometimes smears a wall behind the camera into the picture: upstream's have that, so must these.
+        # Only meshes are culled. Other shapes have few triangles, and Mesa's software driver sometimes smears a wall
+        # behind the camera into the image: upstream's images have that, so these must too.
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
         self._boxes, self._walls, self._mirrors = _Boxes(model), _Walls(model), _Mirrors(model)
         self._burners = _burners(model, scene)
@@ -112,10 +112,10 @@ class Stage:
         self._option.geomgroup[:] = [group in DRAWN_GROUPS for group in range(mujoco.mjNGROUP)]
 
     def check_physics(self, physics: mujoco.MjModel) -> None:
-        """See that poses of a physics model fit.
+        """Check that the poses of a physics model fit.
 
         Raises:
-            RenderError: it is not of the same scene.
+            RenderError: the model is of another scene.
         """
         model = self.model
         if _names(model, _BODY, model.nbody) != _names(physics, _BODY, physics.nbody) or model.nq != physics.nq:
@@ -135,10 +135,10 @@ class Stage:
         return mujoco.MjvScene(self.model, maxgeom=self.model.ngeom + self.model.nsite + _SPARE_GEOMS)
 
     def check(self, cameras: Sequence[str | UserCamera], options: VisualOptions) -> None:
-        """See that all names exist.
+        """Check that all names exist.
 
         Raises:
-            RenderError: a camera, instance, material or texture that this scene does not have.
+            RenderError: this scene does not have a camera, instance, material or texture.
         """
         for camera in (*cameras, *options.cameras):
             if isinstance(camera, str) and ALIASES.get(camera, camera) not in self.cameras:
@@ -161,10 +161,10 @@ class Stage:
         slot: int,
         aspect: float,
     ) -> list[View]:
-        """Fill one frame a camera with what it sees of a slot; ``aspect`` is the image's width over its height."""
+        """Fill one frame per camera with what it sees of a slot; ``aspect`` is the image's width over its height."""
         with self._lock:
             self._place(pose)
-            with self._looking(options):
+            with self._applied(options):
                 return [
                     self._see(frame, self._view(camera, options, slot), aspect)
                     for frame, camera in zip(frames, cameras, strict=True)
@@ -219,27 +219,27 @@ class Stage:
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = view.pos, view.mat.ravel(), view.fovy
         seen = self._seen(view, aspect)
         model.geom_group[:] = np.where(seen | self._always, self._groups, _HIDDEN)
-        # MuJoCo draws everything once more for each mirror, also for one that is out of the picture.
+        # MuJoCo draws everything once more for each mirror, also for one outside the image.
         model.mat_reflectance[:] = np.where(np.isin(np.arange(model.nmat), model.geom_matid[seen]), self._shine, 0)
         eye = mujoco.MjvCamera()
         eye.type, eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         mujoco.mjv_updateScene(model, data, self._option, None, eye, mujoco.mjtCatBit.mjCAT_ALL, frame)
-        # The sky fills the whole picture first, which costs as much as all walls.
+        # The sky fills the whole image first, which costs as much as all walls.
         frame.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = not self._walls.fill(data, view, aspect)
         model.geom_group[:], model.mat_reflectance[:] = self._groups, self._shine
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = before
         return view
 
     def _seen(self, view: View, aspect: float) -> np.ndarray:
-        """Geoms that are in the picture, or in a mirror that is, bool [ngeom]."""
-        seen = self._boxes.in_sight(self._data, _Cone.of_picture(view, aspect, self.clip_planes[0]))
+        """Geoms that are in the image, or in a mirror that is, bool [ngeom]."""
+        seen = self._boxes.in_sight(self._data, _Cone.of_image(view, aspect, self.clip_planes[0]))
         for cone in self._mirrors.cones(self._data, view, seen):
             seen = seen | self._boxes.in_sight(self._data, cone)
         return seen
 
     @contextmanager
-    def _looking(self, options: VisualOptions) -> Iterator[None]:
-        """The model and the posed data with the options' light, colours and textures."""
+    def _applied(self, options: VisualOptions) -> Iterator[None]:
+        """Inside the context, the model and the posed data have the options' light, colours and textures."""
         if options == VisualOptions():
             yield
             return
@@ -258,7 +258,7 @@ class Stage:
         for material, texture in options.textures.items():
             row = _id(model, mujoco.mjtObj.mjOBJ_MATERIAL, material)
             model.mat_texid[row, _RGB] = _id(model, mujoco.mjtObj.mjOBJ_TEXTURE, texture)
-            # Skins are for the texture that was there, and a cube's would not fit them.
+            # Skins fit the texture that was there; a cube texture would not fit them.
             self._groups[self._skins & (model.geom_matid == row)] = _HIDDEN
         try:
             yield
@@ -278,7 +278,7 @@ class Stage:
         material = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, name)
         if material < 0:
             there = ", ".join(self.instances[1:])
-            raise RenderError(f"no instance or material {name!r} to colour; instances: {there}")
+            raise RenderError(f"no instance or material {name!r}; instances: {there}")
         return np.array([material]), np.zeros(0, int)
 
     def _instance(self, kind: int, index: int) -> int:
@@ -291,28 +291,31 @@ class Stage:
 
 @dataclass(frozen=True)
 class _Cone:
-    """What is seen from somewhere: points p with ``sides @ (p - apex) <= bounds``; [S, 3], [3], [S], world frame."""
+    """The region that is visible from a point: points p with ``sides @ (p - apex) <= bounds``, world frame.
+
+    The shapes are [S, 3], [3] and [S].
+    """
 
     sides: np.ndarray
     apex: np.ndarray
     bounds: np.ndarray
 
     @classmethod
-    def of_picture(cls, view: View, aspect: float, near: float) -> _Cone:
-        """What lies beyond the near plane of a camera and between the sides of its picture."""
+    def of_image(cls, view: View, aspect: float, near: float) -> _Cone:
+        """The region beyond the near plane of a camera and between the sides of its image."""
         return cls(_side_normals(view, aspect), view.pos, np.array([-near, 0.0, 0.0, 0.0, 0.0]))
 
 
 class _Boxes:
-    """The bounding boxes of a model's geoms, for leaving out what a camera cannot see.
+    """The bounding boxes of a model's geoms, for culling what a camera cannot see.
 
-    MuJoCo draws everything, and what lies outside the picture costs more than what is in it: software GL clips its
-    triangles one by one.
+    MuJoCo draws everything, and what lies outside the image costs more than what is in it: software GL clips triangles
+    one by one.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._center, self._half = model.geom_aabb[:, :3].copy(), model.geom_aabb[:, 3:].copy()
-        # Planes reach to the horizon; MuJoCo gives them no radius.
+        # Planes are infinite; MuJoCo gives them the radius 0.
         self._endless = model.geom_rbound == 0
 
     def in_sight(self, data: mujoco.MjData, cone: _Cone) -> np.ndarray:
@@ -335,7 +338,7 @@ class _Mirrors:
         self._half[model.geom_type[self._geoms] == mujoco.mjtGeom.mjGEOM_PLANE, 2] = 0
 
     def cones(self, data: mujoco.MjData, view: View, seen: np.ndarray) -> Iterator[_Cone]:
-        """What the mirrors among the seen geoms show: from the eye's mirror image, through the mirror's edges."""
+        """What the visible mirrors show: the region seen from the camera's mirror image through the mirror's edges."""
         for geom, half in zip(self._geoms, self._half, strict=True):
             turn = data.geom_xmat[geom].reshape(3, 3)
             normal, middle = turn[:, 2], data.geom_xpos[geom] + turn[:, 2] * half[2]
@@ -344,7 +347,7 @@ class _Mirrors:
                 continue
             apex = view.pos - 2 * height * normal
             sides, bounds = [-normal], [-height]
-            if (half[:2] > 0).all():  # else it has no end
+            if (half[:2] > 0).all():  # otherwise the mirror is infinite
                 corners = middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half[:2] @ turn[:, :2].T
                 # Edges in turn around +z, seen from below it.
                 sides += list(np.cross(np.roll(corners, -1, axis=0) - apex, corners - apex))
@@ -353,7 +356,7 @@ class _Mirrors:
 
 
 class _Walls:
-    """The opaque boxes and planes of a model that never move, for leaving out a sky that they hide."""
+    """The opaque, immovable boxes and planes of a model, for leaving out a sky that they hide."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE))
@@ -362,28 +365,28 @@ class _Walls:
         self._geoms = np.flatnonzero(flat & still & np.isin(model.geom_group, DRAWN_GROUPS) & (alpha == 1))
         half = model.geom_size[self._geoms].copy()
         planes = model.geom_type[self._geoms] == mujoco.mjtGeom.mjGEOM_PLANE
-        # A plane whose size is 0 has no end; its third size is how finely MuJoCo draws its grid.
+        # A plane whose size is 0 is infinite; its third size is the spacing of MuJoCo's grid.
         half[planes] = np.where(half[planes] > 0, half[planes], np.inf)
         half[planes, 2] = 0
         self._half, self._is_plane = half, planes
 
     def fill(self, data: mujoco.MjData, view: View, aspect: float) -> bool:
-        """Whether all of a grid of rays over the picture, its corners included, end at a wall."""
-        rays = _picture_rays(view, aspect)
+        """Whether all of a grid of rays over the image, its corners included, end at a wall."""
+        rays = _image_rays(view, aspect)
         turn = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
         eye = np.einsum("nji,nj->ni", turn, view.pos - data.geom_xpos[self._geoms])[:, None]
         way = rays @ turn
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.stack([(-self._half[:, None] - eye) / way, (self._half[:, None] - eye) / way])
-        # Not numbers are rays along a face; fmin and fmax leave those out.
+        # Rays along a face give NaN, which fmin and fmax ignore.
         first, last = np.fmax.reduce(ends.min(axis=0), axis=-1), np.fmin.reduce(ends.max(axis=0), axis=-1)
-        # GL draws the fronts only: not a box from inside, nor a plane from below.
+        # GL draws front faces only: no box from inside, no plane from below.
         front = ~self._is_plane[:, None] | (eye[..., 2] > 0)
         return bool(((first <= last) & (first > 0) & front).any(axis=0).all())
 
 
-def _picture_rays(view: View, aspect: float) -> np.ndarray:
-    """Directions from the camera to a grid of points over its picture, world frame, [rays, 3]."""
+def _image_rays(view: View, aspect: float) -> np.ndarray:
+    """Directions from the camera to a grid of points over its image, world frame, [rays, 3]."""
     up = np.tan(np.deg2rad(view.fovy) / 2) * np.linspace(-1, 1, _GRID)
     x, y = np.meshgrid(up * aspect, up)
     return np.stack([x.ravel(), y.ravel(), -np.ones(x.size)], axis=1) @ view.mat.T

@@ -1,9 +1,9 @@
-"""Pictures of a batch in GL: a few threads, each with one GL context, take slots one by one.
+"""Images of a batch in GL: a few threads, each with one GL context, render slots one by one.
 
-In: a stage a scene (``vecenv.libero.render.drawing``), a shot a slot, cameras. Out: arrays [B, H, W, ...] of colours,
-depths and instances, and where the cameras are. MuJoCo's own renderer draws, so ``lod="exact"`` is upstream's picture;
-it releases Python's lock while it draws, so threads draw in parallel and there is no process an environment. A thread
-uploads a scene the first time it draws it, and threads prefer scenes they have.
+In: a stage per scene (``vecenv.libero.render.drawing``), a shot per slot, cameras. Out: arrays [B, H, W, ...] of
+colours, depths and instances, and the cameras' poses. MuJoCo's own renderer draws, so ``lod="exact"`` is upstream's
+image. It releases Python's lock while it draws, so threads draw in parallel and no environment needs a process of its
+own. A thread uploads a scene the first time it draws it, and prefers scenes that it has uploaded.
 
 EGL and OSMesa both draw without a display; physics needs neither.
 """
@@ -24,19 +24,18 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from vecenv.contract import CameraView
 from vecenv.errors import SimulationError
-from vecenv.libero.render.displays import egl_context
+from vecenv.libero.render.displays import GlContext, egl_context
 from vecenv.libero.render.drawing import Pose, Stage, View, camera_view
 from vecenv.libero.render.options import RenderError, UserCamera, VisualOptions
 from vecenv.util.cores import usable_cores
 
-# Library that each way to a context needs, and what installs it.
+# The libraries of each GL backend, and how to install one.
 PACKAGES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "egl": (("libEGL.so.1", "libEGL.so"), "apt-get install libegl1 libgl1-mesa-dri (Debian, Ubuntu), or a GPU driver"),
     "osmesa": (("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"), "apt-get install libosmesa6 (Debian, Ubuntu)"),
@@ -45,28 +44,30 @@ _VARIABLE = "MUJOCO_GL"
 _ATTEMPTS = 2
 _AS_CODES = (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR)
 
-# EGL's display is made with the first context, which only one thread may do.
+# A future, a function and its arguments.
+_Call = tuple[Future[object], Callable[..., object], tuple[object, ...]]
+# EGL's display is opened with the first context, by one thread at a time.
 _opening = threading.Lock()
 
 
 class GlError(SimulationError):
-    """There is no GL to draw with, or it failed; the message says what would help."""
+    """No GL is available, or it failed; the message says what would help."""
 
 
 class _ContextLost(Exception):
-    """GL reports an error: what was uploaded may be gone."""
+    """GL reported an error: what was uploaded may be lost."""
 
 
 def available() -> tuple[str, ...]:
-    """Ways to a context whose library is installed, the one to prefer first."""
+    """The GL backends whose library is installed, in order of preference."""
     return tuple(name for name, (libraries, _) in PACKAGES.items() if any(map(_loads, libraries)))
 
 
 def choose(gl: str | None = None) -> str:
-    """The way to a context: as asked, else what ``MUJOCO_GL`` says, else the first whose library is installed.
+    """The GL backend: as given, else the one that ``MUJOCO_GL`` names, else the first whose library is installed.
 
     Raises:
-        GlError: it is not known or its library is not installed.
+        GlError: the backend is unknown, or its library is not installed.
     """
     there, wanted = available(), gl or os.environ.get(_VARIABLE, "").lower().strip()
     if wanted in PACKAGES:
@@ -84,11 +85,11 @@ def choose(gl: str | None = None) -> str:
     return there[0]
 
 
-def open_context(gl: str, height: int, width: int) -> Any:
-    """A GL context, current in this thread; it has MuJoCo's ``free``.
+def open_context(gl: str, height: int, width: int) -> GlContext:
+    """A new GL context, current in this thread.
 
     Raises:
-        GlError: the driver refuses.
+        GlError: the driver gives none.
     """
     try:
         with _opening:
@@ -123,7 +124,7 @@ def _first_line(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class Shot:
-    """What one slot shows: the stage (index) it is on, its pose, and its visual options."""
+    """What to render of one slot: the index of its stage, its pose, and its visual options."""
 
     stage: int
     pose: Pose
@@ -132,7 +133,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which images of a camera to make."""
+    """Which images of a camera to render."""
 
     rgb: bool = True
     depth: bool = False
@@ -162,11 +163,11 @@ class GlRenderer:
     Args:
         stages: the scenes.
         height, width: of the images, pixels.
-        num_threads: drawing threads; None for one a core. Where the driver gives fewer contexts, fewer draw.
+        num_threads: rendering threads; None for one per core. If the driver gives fewer contexts, fewer threads run.
         gl: ``"egl"``, ``"osmesa"`` or None (``choose``).
 
     Raises:
-        GlError: there is no GL to draw with.
+        GlError: no GL is available.
     """
 
     def __init__(
@@ -199,7 +200,7 @@ class GlRenderer:
 
     @property
     def num_threads(self) -> int:
-        """Threads that draw; fewer than asked for when the driver ran out of contexts."""
+        """The number of threads; fewer than requested if the driver ran out of contexts."""
         return len(self._threads)
 
     def render(
@@ -212,21 +213,20 @@ class GlRenderer:
         """Render every slot through every camera.
 
         Args:
-            shots: one a slot.
+            shots: one per slot.
             cameras: names of the scenes' cameras, ``"wrist"``, or user cameras.
             wanted: which images.
             out: colour arrays to fill, by camera, uint8 [B, H, W, 3]; new ones are made for the others.
 
         Raises:
-            RenderError: a camera, instance, material or texture that a scene does not have, or an array that is not
-                of the right shape.
-            GlError: GL failed, also after its contexts were made anew; or the renderer is closed.
+            RenderError: a scene does not have a camera, instance, material or texture, or an array has the wrong shape.
+            GlError: GL failed, also with new contexts; or the renderer is closed.
         """
         job = _Job.of(self, shots, cameras, wanted, out or {})
         with self._calls:
             if not self._threads:
                 raise GlError("the renderer is closed")
-            self._share_out(job)
+            self._distribute(job)
         return job.frames()
 
     def close(self) -> None:
@@ -237,9 +237,9 @@ class GlRenderer:
             thread.stop()
         _live.discard(self)
 
-    def _share_out(self, job: _Job) -> None:
+    def _distribute(self, job: _Job) -> None:
         order = sorted(range(len(job.shots)), key=lambda slot: job.shots[slot].stage)
-        # Few slots: a task is one image, so that all threads have one.
+        # With few slots a task is one image, so that every thread gets one.
         each = 1 if len(order) < 2 * len(self._threads) else len(job.cameras)
         tasks = [
             _Task(slot, range(first, min(first + each, len(job.cameras))))
@@ -249,7 +249,7 @@ class GlRenderer:
         bounds = np.linspace(0, len(tasks), len(self._threads) + 1).astype(int)
         shares = [deque(tasks[low:high]) for low, high in itertools.pairwise(bounds.tolist())]
         running = [
-            thread.run(_work_off, thread.painter, job, shares, number) for number, thread in enumerate(self._threads)
+            thread.run(_run_tasks, thread.painter, job, shares, number) for number, thread in enumerate(self._threads)
         ]
         errors = [error for future in running if (error := future.exception()) is not None]
         if errors:
@@ -313,12 +313,12 @@ class _Job:
 
 
 def camera_name(camera: str | UserCamera) -> str:
-    """How images name a camera."""
+    """The name of a camera in the images."""
     return camera if isinstance(camera, str) else camera.name
 
 
-def _work_off(painter: _Painter, job: _Job, shares: Sequence[deque[_Task]], own: int) -> None:
-    """Draw the own share, then help others with scenes that are uploaded here already."""
+def _run_tasks(painter: _Painter, job: _Job, shares: Sequence[deque[_Task]], own: int) -> None:
+    """Draw the thread's own share, then tasks of other shares whose scenes are uploaded here already."""
     with contextlib.suppress(IndexError):
         while True:
             painter.draw(job, shares[own].popleft())
@@ -329,23 +329,23 @@ def _work_off(painter: _Painter, job: _Job, shares: Sequence[deque[_Task]], own:
 
 
 class _Painter:
-    """One thread's GL context and what is uploaded to it; only that thread may call its methods."""
+    """One thread's GL context and its uploaded scenes; only that thread may call the methods."""
 
     def __init__(self, stages: Sequence[Stage], gl: str, height: int, width: int) -> None:
         self._stages, self._gl = stages, gl
         self._rect, self._aspect = mujoco.MjrRect(0, 0, width, height), width / height
         self._pixels = np.empty((height, width, 3), np.uint8)
         self._depth = np.empty((height, width), np.float32)
-        self._window: Any = None
+        self._window: GlContext | None = None
         self._contexts: dict[int, mujoco.MjrContext] = {}
         self._frames: dict[int, list[mujoco.MjvScene]] = {}
 
     def open(self) -> None:
-        """Make the GL context."""
+        """Create the GL context."""
         self._window = open_context(self._gl, *self._depth.shape)
 
     def close(self) -> None:
-        """Free everything; what GL has lost already cannot be freed and is let go."""
+        """Free everything; errors are ignored, because what GL has lost cannot be freed."""
         for context in self._contexts.values():
             with contextlib.suppress(Exception):
                 context.free()
@@ -360,7 +360,7 @@ class _Painter:
         return stage in self._contexts
 
     def draw(self, job: _Job, task: _Task) -> None:
-        """Draw a task; when GL has lost its context, make it anew and try again."""
+        """Draw a task; if GL has lost its context, create a new one and try again."""
         for attempt in range(_ATTEMPTS):
             try:
                 self._draw(job, task)
@@ -368,7 +368,7 @@ class _Painter:
             except (_ContextLost, mujoco.FatalError) as error:
                 self.close()
                 if attempt + 1 == _ATTEMPTS:
-                    raise GlError(f"cannot render: {self._gl} fails again and again ({error})") from error
+                    raise GlError(f"cannot render: {self._gl} failed {_ATTEMPTS} times ({error})") from error
                 self.open()
 
     def _draw(self, job: _Job, task: _Task) -> None:
@@ -435,19 +435,19 @@ class _Thread:
 
     def __init__(self, painter: _Painter) -> None:
         self.painter = painter
-        self._calls: queue.SimpleQueue[tuple[Future, Callable[..., Any], tuple] | None] = queue.SimpleQueue()
-        # A daemon: at exit, Python waits for the other kind before it lets anyone close a renderer.
+        self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()
+        # A daemon thread: at exit, Python waits for other threads before a renderer can be closed.
         self._thread = threading.Thread(target=self._loop, name="vecenv-gl", daemon=True)
         self._thread.start()
 
-    def run(self, call: Callable[..., Any], *arguments: Any) -> Future:
+    def run(self, call: Callable[..., object], *arguments: object) -> Future[object]:
         """Call in this thread."""
-        future: Future = Future()
+        future: Future[object] = Future()
         self._calls.put((future, call, arguments))
         return future
 
     def stop(self) -> None:
-        """Free what the painter holds, and end."""
+        """Free the painter's resources and end the thread."""
         self._calls.put(None)
         self._thread.join()
 
@@ -457,7 +457,7 @@ class _Thread:
         self.painter.close()
 
 
-def _answer(future: Future, call: Callable[..., Any], arguments: Iterable[Any]) -> None:
+def _answer(future: Future[object], call: Callable[..., object], arguments: Iterable[object]) -> None:
     try:
         future.set_result(call(*arguments))
     except BaseException as error:
@@ -469,7 +469,7 @@ _live: weakref.WeakSet[GlRenderer] = weakref.WeakSet()
 
 @functools.cache
 def _close_at_exit() -> None:
-    """Close what is open at exit: called once there is a context, to come before PyOpenGL ends its display."""
+    """Close open renderers at exit; registered after the first context, to run before PyOpenGL ends its display."""
     atexit.register(_close_all)
 
 

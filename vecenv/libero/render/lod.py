@@ -1,10 +1,10 @@
-"""Fewer triangles: the levels of detail draw simplified meshes, which look the same or almost and cost less.
+"""Levels of detail: simplified meshes, which look the same or nearly so and take less time to draw.
 
 In: the compiled visual model of a scene. Out: the same model, its visual meshes replaced in place by simplified ones;
-geoms, materials, textures and everything else stay. ``"exact"`` leaves out what is far below a pixel, ``"fast"`` more,
-``"original"`` nothing. The simplified meshes come with the package (``simplified.npz``, made by
-``scripts/simplify_meshes.py``) and are found by the content of the mesh they replace, so a mesh that is not known there
-is drawn as it is. Every triangle corner of a simplified mesh is a corner of the original, position and texture
+geoms, materials, textures and everything else stay. ``"exact"`` removes detail far below a pixel, ``"fast"`` more,
+``"original"`` none. The simplified meshes come with the package (``simplified.npz``, made by
+``scripts/simplify_meshes.py``) and are found by the content of the mesh they replace, so an unknown mesh is drawn
+as it is. Every triangle corner of a simplified mesh is a corner of the original, position and texture
 coordinate alike; triangles that are new have new normals, averages of what was around.
 """
 
@@ -20,10 +20,10 @@ import mujoco
 import numpy as np
 
 FILE = "simplified.npz"
-# Levels that the file has.
+# The levels in the file.
 STORED = ("exact", "fast")
-# Meshes of fewer triangles are drawn whole: there is little to gain and, close to a camera, the shade of a knob or of a
-# book's pages to lose (38 to 41 dB).
+# Meshes of fewer triangles are not simplified: it would save little and, close to a camera, change the shade of a knob
+# or of a book's pages (38 to 41 dB).
 LEAST = {"exact": 8000, "fast": 0}
 # Normals are stored as whole numbers up to this.
 NORMAL_SCALE = 127
@@ -68,7 +68,7 @@ class Mesh:
 
     @property
     def key(self) -> str:
-        """Hash of what it looks like, 16 hexadecimal digits."""
+        """Hash of its shape and texture coordinates, 16 hexadecimal digits."""
         digest = hashlib.sha256()
         for array in (self.vert, self.face, self.texcoord, self.face_texcoord):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -97,7 +97,7 @@ class Simplified:
 
 
 def simplify(model: mujoco.MjModel, level: str = "fast") -> int:
-    """Replace the drawn meshes of a model by the simplified ones that are known; returns how many triangles are left.
+    """Replace the drawn meshes of a model by the simplified ones that are known; returns how many triangles remain.
 
     Geoms that collide share no mesh with geoms that are drawn, and if one did, it would collide as before: MuJoCo
     collides with convex hulls, which are left alone.
@@ -144,7 +144,7 @@ def _replace(model: mujoco.MjModel, mesh: Mesh, new: Simplified) -> None:
 def _normal_rows(mesh: Mesh, new: Simplified) -> np.ndarray:
     """Rows of the mesh's normals for the new triangles, int [n, 3]; rows that nothing uses any more are overwritten.
 
-    Where there are not enough of those, the corners keep the normals they had: a smooth mesh, whose few normals do.
+    If there are too few of those, the corners keep their normals: the mesh is smooth, and its few normals suffice.
     """
     distinct, which = np.unique(new.normals.reshape(-1, 3), axis=0, return_inverse=True)
     unused = np.setdiff1d(np.arange(len(mesh.normal)), mesh.face_normal[new.kept])

@@ -1,4 +1,4 @@
-"""What a picture is taken of and with, as data: cameras, what may look different in a slot, and how to render.
+"""Rendering options as data: cameras, visual options of a slot, and how to render.
 
 Nothing here draws. ``RenderConfig`` goes into ``vecenv.make``; ``UserCamera`` adds a viewpoint; ``VisualOptions``
 changes light, viewpoint, colours and textures of one slot, and ``VisualVariation.draw`` makes one from a seed.
@@ -9,42 +9,43 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from vecenv.errors import InvalidInput
 
-# Names that policies use for MuJoCo's cameras.
+# The names that policies use, and MuJoCo's names of the same cameras.
 ALIASES: Mapping[str, str] = MappingProxyType({"wrist": "robot0_eye_in_hand"})
-# The two that VLA policies are trained on, in their order.
+# The two cameras that VLA policies are trained on, in their order.
 POLICY_CAMERAS = ("agentview", "wrist")
 LODS = ("original", "exact", "fast")
 ENGINES = ("gl", "raytrace")
 COLORS = ("published", "current")
-# MuJoCo's framebuffer and most drivers end here.
+# The limit of MuJoCo's framebuffer and of most drivers.
 LARGEST_SIDE = 4096
 
 
 class RenderError(InvalidInput):
-    """A camera, instance, texture or option that does not exist; the message names it and what there is."""
+    """A camera, instance, texture or option does not exist; the message names it and those that do."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class UserCamera:
-    """A viewpoint of one's own; poses are in the world frame and may differ between slots.
+    """An additional camera; poses are in the world frame and may differ between slots.
 
     Attributes:
-        name: how images name it; must not be that of a camera of the scene.
+        name: its name in the images; no camera of the scene may have it.
         pos: metres, [3] or [B, 3].
         quat: wxyz, [4] or [B, 4]; a camera looks along its -z axis, +y is up.
         fovy: vertical field of view, degrees, one number or [B].
     """
 
     name: str
-    pos: Any
-    quat: Any
-    fovy: Any = 45.0
+    pos: npt.ArrayLike
+    quat: npt.ArrayLike
+    fovy: npt.ArrayLike = 45.0
 
     def __post_init__(self) -> None:
         for field_name, width in (("pos", 3), ("quat", 4)):
@@ -57,19 +58,26 @@ class UserCamera:
             raise RenderError(f"camera {self.name!r}: fovy={self.fovy}: need degrees between 0 and 180")
 
     @classmethod
-    def looking_at(cls, name: str, eye: Any, target: Any, up: Any = (0, 0, 1), fovy: Any = 45.0) -> UserCamera:
+    def looking_at(
+        cls,
+        name: str,
+        eye: npt.ArrayLike,
+        target: npt.ArrayLike,
+        up: npt.ArrayLike = (0, 0, 1),
+        fovy: npt.ArrayLike = 45.0,
+    ) -> UserCamera:
         """A camera at ``eye`` [3] that looks at ``target`` [3], both in metres."""
         back = np.asarray(eye, float) - np.asarray(target, float)
         right = np.cross(np.asarray(up, float), back)
         if np.linalg.norm(right) < 1e-9:
-            raise RenderError(f"camera {name!r}: looks along its up direction, or at itself")
+            raise RenderError(f"camera {name!r}: it looks along its up direction, or its target is its own position")
         axes = np.stack([_unit(right), _unit(np.cross(back, right)), _unit(back)], axis=1)
         return cls(name=name, pos=np.asarray(eye, float), quat=quat_of(axes), fovy=fovy)
 
     def in_slot(self, slot: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Position [3], axes in columns [3, 3] and field of view in degrees, in one slot."""
 
-        def own(value: Any, dims: int) -> np.ndarray:
+        def own(value: npt.ArrayLike, dims: int) -> np.ndarray:
             array = np.asarray(value, float)
             return array if array.ndim == dims else array[slot]
 
@@ -93,15 +101,15 @@ class CameraShift:
 
 @dataclass(frozen=True, kw_only=True)
 class VisualOptions:
-    """How one slot looks different from upstream; physics and goals never notice. The default changes nothing.
+    """How the images of one slot differ from upstream's; physics and goals do not change. The default changes nothing.
 
     Attributes:
-        light: scale of all light, 1 leaves it.
+        light: scale of all light, 1 for no change.
         light_color: scale of red, green and blue light, [3].
         light_shift: moves the lamps, metres, world frame, [3].
         cameras: by camera, how it is moved.
         colors: by instance (an object, a fixture, ``"robot"``) or material, what its red, green, blue are scaled by.
-        textures: by material, the texture of the scene it wears.
+        textures: by material, the scene's texture that it gets.
     """
 
     light: float = 1.0
@@ -114,7 +122,7 @@ class VisualOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class VisualVariation:
-    """How far visual options may stray; ``draw`` picks one of them.
+    """Ranges of visual options; ``draw`` samples from them.
 
     Attributes:
         light: the light's scale lies within 1 plus or minus this.
@@ -126,7 +134,7 @@ class VisualVariation:
         cameras: the cameras that move.
         color: scales of the instances' red, green, blue lie within 1 plus or minus this.
         instances: the instances that change colour.
-        textures: by material, the textures it may wear.
+        textures: by material, the textures it may get.
     """
 
     light: float = 0.0
@@ -141,7 +149,7 @@ class VisualVariation:
     textures: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def draw(self, seed: int | Sequence[int]) -> VisualOptions:
-        """Options that depend on the seed alone; give (seed, episode), say, to vary by episode."""
+        """Sample options; they depend on the seed alone. A seed of (seed, episode) varies them by episode."""
         rng = np.random.default_rng(seed)
 
         def around(center: float, spread: float) -> tuple[float, float, float]:
@@ -171,13 +179,13 @@ class RenderConfig:
 
     Attributes:
         height, width: of every image, pixels.
-        lod: ``"exact"``, upstream's picture to within what can be seen; ``"original"``, with every triangle that
+        lod: ``"exact"``, upstream's image without visible differences; ``"original"``, with every triangle that
             upstream draws; or ``"fast"``, simplified meshes (``vecenv.libero.render.lod``).
         cameras: cameras besides those of the scene.
-        gl: ``"egl"``, ``"osmesa"``, or None for what ``MUJOCO_GL`` says, else the first of them that works.
+        gl: ``"egl"``, ``"osmesa"``, or None for the one that ``MUJOCO_GL`` names, else the first that is installed.
         engine: ``"gl"``, upstream's renderer; or ``"raytrace"``, MuJoCo Warp's, which needs no GL and is fast on NVIDIA
-            GPUs; its pictures differ a little, and of visual options it swaps no textures and colours no materials.
-        num_threads: rendering threads, each with a GL context; None for one a core.
+            GPUs; its images differ a little, and of visual options it swaps no textures and colours no materials.
+        num_threads: rendering threads, each with a GL context; None for one per core.
         colors: ``"published"``, textures as MuJoCo up to 3.3.2 shows them, under which LIBERO's demonstrations were
             rendered and its checkpoints scored; or ``"current"``, as the installed MuJoCo shows them
             (``vecenv.libero.render.colors`` says what differs).
@@ -201,50 +209,35 @@ class RenderConfig:
             raise RenderError(f"engine={self.engine!r}: expected one of {', '.join(ENGINES)}")
         check_colors(self.colors)
         if self.num_threads is not None and self.num_threads < 1:
-            raise RenderError(f"num_threads={self.num_threads}: need at least 1, or None for one a core")
+            raise RenderError(f"num_threads={self.num_threads}: need at least 1, or None for one per core")
         names = [camera.name for camera in self.cameras]
         if len(set(names)) != len(names):
             raise RenderError(f"two cameras have the same name: {', '.join(names)}")
 
 
 def check_colors(colors: str) -> None:
-    """See that these are colours that there are.
+    """Check the name of a texture decoding.
 
     Raises:
-        RenderError: they are not; the message names those that are.
+        RenderError: it does not exist; the message names those that do.
     """
     if colors not in COLORS:
         raise RenderError(f"colors={colors!r}: expected one of {', '.join(COLORS)}")
 
 
-def matrix_of(quat: np.ndarray) -> np.ndarray:
+def matrix_of(quat: npt.ArrayLike) -> np.ndarray:
     """Rotation matrix [3, 3] of a quaternion wxyz [4] of any length but 0."""
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(np.asarray(quat, float), scalar_first=True).as_matrix()
 
 
-def quat_of(matrix: np.ndarray) -> np.ndarray:
+def quat_of(matrix: npt.ArrayLike) -> np.ndarray:
     """Quaternion wxyz [4] of a rotation matrix [3, 3]."""
-    import mujoco
-
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(matrix, float).ravel())
-    return quat
+    return Rotation.from_matrix(np.asarray(matrix, float)).as_quat(scalar_first=True)
 
 
 def rotation_of(vector: Sequence[float]) -> np.ndarray:
     """Rotation matrix [3, 3] of a rotation vector [3], radians."""
-    turn = np.asarray(vector, float)
-    angle = float(np.linalg.norm(turn))
-    if angle == 0.0:
-        return np.eye(3)
-    return matrix_of(np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * turn / angle]))
+    return Rotation.from_rotvec(np.asarray(vector, float)).as_matrix()
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

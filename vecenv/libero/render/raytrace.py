@@ -1,41 +1,51 @@
-"""Pictures of worlds by ray tracing inside ``jax.jit``: MuJoCo Warp's renderer, on NVIDIA GPUs, without GL.
+"""Images of worlds, ray traced inside ``jax.jit``: MuJoCo Warp's renderer, on NVIDIA GPUs, without GL.
 
 In: a scenery (``vecenv.libero.render.scenery``) and, for each world, the poses of its bodies as MJX keeps them. Out:
 images of one or several cameras, as delivered everywhere in vecenv: rows from the top, mirrored. ``RayTracer.look`` is
 a function of one world for ``vmap``, ``jit`` and ``scan``; all worlds it is mapped over share one render context, which
-is made when such a batch is first traced. On a CPU the same code runs, slowly.
+is created when such a batch is first traced. On a CPU the same code runs, slowly.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx.warp import render_context
 
+from vecenv.libero.physics.mjx.private import render_context
 from vecenv.libero.render.drawing import Pose, View
 from vecenv.libero.render.gl import Frames, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, UserCamera, VisualOptions
-from vecenv.libero.render.ray_kernel import HEADLIGHT, make_kernel
-from vecenv.libero.render.scenery import Scenery, drawn_colors, installed_scenery
-from vecenv.libero.scene.bddl import Problem
+from vecenv.libero.render.ray_kernel import make_kernel
+from vecenv.libero.render.ray_light import HEADLIGHT
+from vecenv.libero.render.scenery import Scenery, installed_scenery
+from vecenv.libero.render.surfaces import drawn_colors
+from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.util.mapped import Sized
 from vecenv.util.rotations import quat_to_mat
 
+if TYPE_CHECKING:
+    from mujoco.mjx.third_party.mujoco_warp import RenderContext
+
+_LookKey = tuple[SceneKey, tuple[str, ...], Wanted]
 # Threads of a block on the GPU, registers of a thread, and the tile of pixels, rows and columns, that threads next to
 # each other trace: rays that travel together are faster. Measured on an H200, benchmarks/render_gpu.py.
 BLOCK, REGISTERS, TILE = 128, 96, (8, 8)
 
 
+# A leaf of a pytree: NumPy outside of JAX's transformations, JAX inside.
+Array = np.ndarray | jax.Array
+
+
 class Seen(NamedTuple):
-    """Images of C cameras of one world; what was not asked for is None.
+    """Images of C cameras of one world; those that were not requested are None.
 
     Attributes:
         rgb: uint8 [C, H, W, 3].
@@ -49,39 +59,39 @@ class Seen(NamedTuple):
 
 
 class Style(NamedTuple):
-    """How one world with C cameras and a scenery of I instances is looked at, and how it looks; see ``plain_style``.
+    """Camera poses and appearance of one world, with C cameras and a scenery of I instances; see ``plain_style``.
 
     Attributes:
         light: scale of red, green and blue light, [3].
         lamps: moves all lamps, metres, world frame, [3].
         colors: scale of red, green, blue of each of the scenery's ``instances``, [I, 3].
-        pos, turn: move each camera, metres [C, 3], and turn it [C, 3, 3], in its own frame (x right, y up, looking
-            along -z); those of a free camera are its pose in the world.
+        pos, turn: translation [C, 3], metres, and rotation [C, 3, 3] of each camera in its own frame (x right, y up,
+            looking along -z); for a free camera, its pose in the world.
         fovy: vertical field of view of each camera, degrees, [C].
     """
 
-    light: Any
-    lamps: Any
-    colors: Any
-    pos: Any
-    turn: Any
-    fovy: Any
+    light: Array
+    lamps: Array
+    colors: Array
+    pos: Array
+    turn: Array
+    fovy: Array
 
 
 class RayTracer:
     """The cameras of a scenery.
 
     Args:
-        scenery: what there is to see.
+        scenery: what is drawn.
         height, width: of the images, pixels.
-        cameras: which cameras, in the order of the images; ``"wrist"`` is another name of ``"robot0_eye_in_hand"``, and
-            None is a free camera, which a ``Style`` puts somewhere.
+        cameras: which cameras, in the order of the images; ``"wrist"`` is an alias of ``"robot0_eye_in_hand"``, and
+            None is a free camera, whose pose a ``Style`` gives.
         rgb, depth, segmentation: which images ``look`` makes.
-        samples: rays a pixel along each side, averaged; GL takes four a pixel. Two cost four times as much.
+        samples: rays per pixel along each side, averaged; GL takes four samples per pixel. 2 takes four times as long.
         block_dim: threads of a block on the GPU.
         tile: most rows and columns of pixels that neighbouring threads trace; ``(1, 1)`` for row by row.
         registers: most registers of a thread on the GPU; 0 leaves it to the compiler.
-        culling: whether faces are seen from their front only, as GL shows them; without, images are 7 % faster.
+        culling: whether faces are visible from their front only, as in GL; without, rendering is 7 % faster.
 
     Raises:
         RenderError: the scenery has no such camera.
@@ -120,7 +130,7 @@ class RayTracer:
 
     @property
     def plain_style(self) -> Style:
-        """The style that changes nothing; a free camera is at the world's origin and looks down, with 45 degrees."""
+        """The style that changes nothing; a free camera is at the world's origin, looks down, and has a fovy of 45."""
         count = len(self.cameras)
         fovy = np.where(self._is_free, 45.0, self._model.cam_fovy[self._camera_ids])
         return Style(
@@ -133,13 +143,13 @@ class RayTracer:
         )
 
     def look(self, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array, style: Style | None = None) -> Seen:
-        """What the cameras of one world see.
+        """Render what the cameras of one world see.
 
         Args:
             xpos: positions of the bodies of the physics model, world frame, metres, [nbody, 3].
             xquat: their orientations, wxyz, [nbody, 4].
-            qpos: [nq], read for what glows while a joint is turned.
-            style: how it looks; None for ``plain_style``.
+            qpos: [nq], read for burners, which are visible while a knob is turned.
+            style: None for ``plain_style``.
         """
         return self._look(xpos, xquat, qpos) if style is None else self._look(xpos, xquat, qpos, style)
 
@@ -164,8 +174,8 @@ class RayTracer:
                 self._contexts[num_worlds] = context
         return self._contexts[num_worlds].pytree()
 
-    def _tile_rays(self, context: Any) -> None:
-        """Put a render context's rays, which are row by row for each camera and sample, into the order of tiles."""
+    def _tile_rays(self, context: RenderContext) -> None:
+        """Reorder a render context's rays from rows of pixels to tiles, for each camera and sample."""
         (rows, columns), rays = self._tile, context.ray.numpy()
         tiled = rays.reshape(-1, self.height // rows, rows, self.width // columns, columns, 3).swapaxes(2, 3)
         context.ray.assign(np.ascontiguousarray(tiled).reshape(rays.shape))
@@ -224,12 +234,12 @@ class RayTracer:
         )
 
     def _widths(self, style: Style) -> jax.Array:
-        """How much wider cameras see than those that the contexts' rays are of."""
+        """How much wider the cameras see than those that the contexts' rays were made for."""
         half = np.tan(np.deg2rad(self._model.cam_fovy[self._camera_ids]) / 2)
         return jnp.tan(jnp.deg2rad(jnp.asarray(style.fovy)) / 2) / jnp.asarray(half, jnp.float32)
 
     def _colors(self, qpos: jax.Array, style: Style) -> jax.Array:
-        """Colours of the geoms; what does not glow has alpha 0, which rays pass."""
+        """Colours of the geoms; a burner that is off has alpha 0, which makes it invisible."""
         rgba = jnp.asarray(drawn_colors(self._model))
         rgba = rgba.at[:, :3].multiply(jnp.asarray(style.colors)[self.scenery.instance_of_geom])
         for burner in self.scenery.burners:
@@ -239,7 +249,7 @@ class RayTracer:
         return rgba
 
     def _delivered(self, rgb: jax.Array, depth: jax.Array, segmentation: jax.Array | None) -> Seen:
-        """Of the renderer's flat buffers of all cameras."""
+        """The images of all cameras from the renderer's flat buffers."""
         wants_rgb, wants_depth, _ = self._wanted
         return Seen(
             rgb=_unpacked(self._image(rgb.reshape(-1))) if wants_rgb else None,
@@ -248,23 +258,26 @@ class RayTracer:
         )
 
     def _instances(self, codes: jax.Array) -> jax.Array:
-        """Of the geom and object type [..., 2] of each pixel."""
+        """Instances from the geom and object type [..., 2] of each pixel."""
         table = jnp.asarray(np.append(self.scenery.instance_of_geom, np.int16(0)))
-        return table[codes[..., 0]]  # -1 is nothing, the table's last
+        return table[codes[..., 0]]  # -1, the table's last entry, is the background
+
+
+_Compiled = tuple[RayTracer, Callable[..., Seen]]
 
 
 class RayRenderer:
-    """Renders batches as ``vecenv.libero.render.gl.GlRenderer`` does, without GL: one call of ``RayTracer`` for each
+    """Renders batches as ``vecenv.libero.render.gl.GlRenderer`` does, without GL: one call of ``RayTracer`` per
     scene.
 
     Args:
-        config: sizes, level of detail and cameras of one's own.
+        config: sizes, level of detail and user cameras.
     """
 
     def __init__(self, config: RenderConfig) -> None:
         self._config = config
-        self._own = {camera.name: camera for camera in config.cameras}
-        self._looks: dict[tuple, tuple[RayTracer, Any]] = {}
+        self._user_cameras = {camera.name: camera for camera in config.cameras}
+        self._looks: dict[_LookKey, _Compiled] = {}
 
     def render(
         self,
@@ -277,7 +290,7 @@ class RayRenderer:
         """Render every slot through every camera.
 
         Args:
-            shots: one a slot; their stages count through ``problems``.
+            shots: one per slot; their stages index ``problems``.
             problems, models: the scenes and their physics models.
             cameras: names of the scenes' cameras or of the configuration's.
             wanted: which images.
@@ -295,22 +308,22 @@ class RayRenderer:
             styles = self._styles(tracer, cameras, slots, [shots[slot].options for slot in slots])
             seen = look(*_states(model, [shots[slot].pose for slot in slots]), *styles)
             for images, made in ((rgb, seen.rgb), (depth, seen.depth), (segmentation, seen.segmentation)):
-                for number, name in enumerate(cameras if images else ()):
-                    images[name][slots] = np.asarray(made[:, number])
+                for number, name in enumerate(cameras if made is not None else ()):
+                    images[name][slots] = np.asarray(made)[:, number]
         return Frames(rgb, depth, segmentation, {})
 
     def close(self) -> None:
-        """Forget what was compiled. Closing twice is harmless."""
+        """Drop what was compiled. Closing twice is harmless."""
         self._looks = {}
 
-    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> tuple[RayTracer, Any]:
+    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> _Compiled:
         key = (problem.scene_key(), cameras, wanted)
         if key not in self._looks:
             tracer = RayTracer(
                 installed_scenery(problem, self._config.lod, self._config.colors),
                 height=self._config.height,
                 width=self._config.width,
-                cameras=[None if name in self._own else name for name in cameras],
+                cameras=[None if name in self._user_cameras else name for name in cameras],
                 rgb=wanted.rgb,
                 depth=wanted.depth,
                 segmentation=wanted.segmentation,
@@ -321,32 +334,32 @@ class RayRenderer:
     def _styles(
         self, tracer: RayTracer, cameras: Sequence[str], slots: Sequence[int], options: Sequence[VisualOptions]
     ) -> tuple[Style, ...]:
-        """The slots' styles, stacked; none where nothing differs from the scene's own look."""
-        if all(name not in self._own for name in cameras) and all(each == VisualOptions() for each in options):
+        """The slots' styles, stacked; empty if nothing differs from the plain style."""
+        if all(name not in self._user_cameras for name in cameras) and all(each == VisualOptions() for each in options):
             return ()
-        own = [[self._own.get(name, name) for name in cameras]] * len(slots)
+        own = [[self._user_cameras.get(name, name) for name in cameras]] * len(slots)
         styles = [style_of(tracer, *each) for each in zip(options, own, slots, strict=True)]
         return (jax.tree.map(lambda *arrays: np.stack(arrays), *styles),)
 
 
 def style_of(tracer: RayTracer, options: VisualOptions, cameras: Sequence[str | UserCamera], slot: int) -> Style:
-    """The style of a slot's visual options, and of its cameras, which are the tracer's.
+    """The style of a slot's visual options and cameras; ``cameras`` are those of the tracer.
 
     Raises:
-        RenderError: the options swap textures, or colour what is no instance of the scene.
+        RenderError: the options swap textures, or name something to colour that is no instance of the scene.
     """
     if options.textures:
-        raise RenderError("engine='raytrace' swaps no textures; use engine='gl'")
+        raise RenderError("engine='raytrace' cannot swap textures; use engine='gl'")
     style = tracer.plain_style
     style.light[:] = options.light * np.asarray(options.light_color)
     style.lamps[:] = options.light_shift
     for name, color in options.colors.items():
         if name not in tracer.scenery.instances[1:]:
             there = ", ".join(tracer.scenery.instances[1:])
-            raise RenderError(f"engine='raytrace' colours instances only, and {name!r} is none; there are {there}")
+            raise RenderError(f"engine='raytrace' colours instances only, and {name!r} is none; instances: {there}")
         style.colors[tracer.scenery.instances.index(name)] = color
     for number, camera in enumerate(cameras):
-        view = View(style.pos[number], style.turn[number], float(style.fovy[number]))
+        view = View(np.asarray(style.pos[number]), np.asarray(style.turn[number]), float(style.fovy[number]))
         name = camera.name if isinstance(camera, UserCamera) else camera
         view = View(*camera.in_slot(slot)) if isinstance(camera, UserCamera) else view
         shift = next((options.cameras[key] for key in _names(name) if key in options.cameras), None)
@@ -356,13 +369,13 @@ def style_of(tracer: RayTracer, options: VisualOptions, cameras: Sequence[str | 
 
 
 def _names(camera: str) -> tuple[str, ...]:
-    """All names of a camera."""
+    """A camera's name and its aliases."""
     real = ALIASES.get(camera, camera)
     return real, *(alias for alias, other in ALIASES.items() if other == real)
 
 
 def _lamps(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """What MJX knows of lamps, with the headlight as one more if it is on."""
+    """MJX's fields of the lights, with the headlight as one more light if it is on."""
     head, colors = model.vis.headlight, ("ambient", "diffuse", "specular")
     more = {
         "type": HEADLIGHT,
@@ -392,7 +405,7 @@ def _states(model: mujoco.MjModel, shown: Sequence[Pose]) -> tuple[np.ndarray, .
 def poses(
     model: mujoco.MjModel, qpos: np.ndarray, body_pos: np.ndarray, body_quat: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the bodies of B worlds are, for ``RayTracer.look``, where no MJX computed it.
+    """Poses of the bodies of B worlds for ``RayTracer.look``, computed without MJX.
 
     Args:
         model: the physics model.

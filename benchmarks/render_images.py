@@ -1,8 +1,8 @@
 """Make ``docs/rendering/``: the same state as upstream draws it under MuJoCo 3.3.0, and as vecenv does.
 
-    python benchmarks/render_pictures.py [--peer .venv-upstream/bin/python]
+    python benchmarks/render_images.py [--peer .venv-upstream/bin/python]
 
-Each picture has upstream, ``lod="exact"``, ``lod="fast"`` and, with the colours of the installed MuJoCo, ``"current"``
+Each image has upstream, ``lod="exact"``, ``lod="fast"`` and, with the colours of the installed MuJoCo, ``"current"``
 from left to right, the third-person camera above and the wrist camera below. Prints how alike they are: PSNR in dB and
 SSIM against upstream, the lower of the two cameras.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from common import ROOT
 from images import REFERENCES, RENDER, add_peer, write_references
-from support.pictures import Reference, agreement, ssim
+from support.images import Reference, agreement, ssim
 
 SCENES = ("libero_object-0", "libero_spatial-0", "libero_goal-0", "libero_10-0")
 FOLDER = ROOT / "docs" / "rendering"

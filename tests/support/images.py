@@ -1,4 +1,4 @@
-"""What tests of pictures share: how alike two are, whether this machine can draw any, and upstream's own in files."""
+"""What tests of images share: how alike two are, whether this machine can draw any, and upstream's own in files."""
 
 from __future__ import annotations
 
