@@ -12,7 +12,7 @@ import pytest
 
 from vecenv.controllers import joint, kinematics
 from vecenv.controllers.osc import ArmState
-from vecenv.libero.scene.scene import HOME_QPOS
+from vecenv.libero.robot import HOME_QPOS, panda_chain
 from vecenv.libero.tasks.sources import installed_tasks
 
 compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -47,7 +47,7 @@ def test_wrong_shapes_are_refused() -> None:
 
 def test_the_arm_holds_still_and_goes_where_it_is_told() -> None:
     model = installed_tasks("libero_object")[0].scene(()).model
-    chain = kinematics.chain_from_model(model)
+    chain = panda_chain(model)
 
     @compiled
     def control(qpos: jax.Array, qvel: jax.Array, goal: jax.Array) -> jax.Array:

@@ -19,21 +19,19 @@ import numpy as np
 
 from vecenv import assets
 from vecenv.errors import InvalidInput
+from vecenv.libero.robot import (
+    ARM_DAMPING,
+    ARM_FRICTIONLOSS,
+    ARM_JOINTS,
+    BASE_BODY,
+    FINGER_JOINTS,
+    GRIP_SITE,
+    HAND_BODY,
+)
 from vecenv.libero.scene import catalog, contacts, mjcf
 from vecenv.libero.scene.arenas import ARENAS, Arena
 from vecenv.libero.scene.bddl import Problem, Region
 from vecenv.libero.scene.contacts import Contacts
-
-# Robot pose at reset, radians (robosuite's Panda as LIBERO mounts it).
-HOME_QPOS = np.array([0.0, -1.61037389e-01, 0.0, -2.44459747, 0.0, 2.22675220, np.pi / 4])
-HOME_FINGER_QPOS = np.array([0.020833, -0.020833])
-ARM_DAMPING = (0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01)
-ARM_FRICTIONLOSS = 0.1
-ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
-FINGER_JOINTS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
-GRIP_SITE = "gripper0_grip_site"
-HAND_BODY = "robot0_right_hand"
-BASE_BODY = "robot0_base"
 
 # Memory of one simulation's contacts and constraints, allocated as it is used. The 32 scenes use 1.3 MB at most in the
 # first 60 substeps of their starts with all fixtures in one place. A full arena is reported as a fault, never ignored.
