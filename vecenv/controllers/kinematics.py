@@ -1,6 +1,6 @@
 """Kinematics and dynamics of the robot alone, from its joint state: what the controller reads, without a simulator.
 
-In: constants of the arm and its two fingers (a ``Chain``, which ``chain.chain_from_model`` reads from a compiled model),
+In: constants of the arm and its two fingers (``Chain``, which ``chain.chain_from_model`` reads from a compiled model),
 and joint positions and velocities [..., 9]. Out: the ``ArmState`` that ``osc.torques`` takes (``arm_state``), and the
 pose that proprioception reports (``hand_pose``). The numbers are those of MuJoCo's ``mj_forward``: ``site_xpos``,
 ``site_xmat``, ``mj_jacSite``, the mass matrix, ``qfrc_bias``, ``xquat``. So the controller can run before the physics

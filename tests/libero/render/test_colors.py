@@ -18,7 +18,7 @@ from support.paths import DATA
 from support.pictures import Reference, agreement, needs_gl
 
 import vecenv
-from vecenv.libero.functional.env import FunctionalConfig, FunctionalError
+from vecenv.libero.functional import FunctionalConfig, FunctionalError
 from vecenv.libero.render import cameras as eyes
 from vecenv.libero.render import colors
 from vecenv.libero.render.gl import choose, open_context

@@ -94,9 +94,9 @@ class Entity:
     radius: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """A compiled scene.
+    """A compiled scene, equal only to itself.
 
     Attributes:
         problem_name: LIBERO's problem class, lower case.
