@@ -40,6 +40,7 @@ def test_torques_and_goals_stay_within_limits() -> None:
     np.testing.assert_allclose(goal, [0.05, 1.0, -1.0, 0.025, 0, 0, 0], atol=1e-6)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="action"):
         joint.set_goal(jnp.zeros(7), jnp.zeros(8), jnp.zeros((2, 7)))

@@ -363,6 +363,7 @@ def test_names_of_the_wrong_number_or_place_are_refused() -> None:
         chain_from_model(model, **{**names, "hand": "link6"})
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_wrong_shapes_are_named(chain: Chain) -> None:
     with pytest.raises(ValueError, match=r"qvel must have shape \[..., 9\], got \[2, 7\]"):
         arm_state(chain, np.zeros((2, 9)), np.zeros((2, 7)))

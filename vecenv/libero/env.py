@@ -205,11 +205,13 @@ class LiberoEnv(SlotBatch):
 
     def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         poses = waypoint.Pose(targets[:, None, :3], targets[:, None, 3:7])
-        plan = waypoint.Plan(poses, targets[:, 7:], hold[:, None], moves[:, None])
+        plan = waypoint.WaypointPlan(poses, targets[:, 7:], hold[:, None], moves[:, None])
         reward, arrived, _ = self._follow(plan)
         return reward, arrived[:, 0]
 
-    def _follow(self, plan: waypoint.Plan, max_misses: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _follow(
+        self, plan: waypoint.WaypointPlan, max_misses: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         followed = self.physics.follow(
             plan,
             ~self._done,

@@ -593,7 +593,7 @@ def follow_plan(
     system: System,
     table: goals.GoalTable,
     worlds: World,
-    plan: waypoint.Plan,
+    plan: waypoint.WaypointPlan,
     active: jax.Array,
     limit: jax.Array,
     max_misses: jax.Array,
@@ -720,7 +720,7 @@ def _follow(
     max_misses: jax.Array,
     table: goals.GoalTable,
     worlds: World,
-    plan: waypoint.Plan,
+    plan: waypoint.WaypointPlan,
     active: jax.Array,
     limit: jax.Array,
     **options: Any,
@@ -956,7 +956,7 @@ class MjxPhysics(Physics):
 
     def follow(
         self,
-        plan: waypoint.Plan,
+        plan: waypoint.WaypointPlan,
         active: np.ndarray,
         limit: np.ndarray,
         config: waypoint.WaypointConfig,
