@@ -8,6 +8,7 @@ from pathlib import Path
 import jaxtyping
 import pytest
 from hypothesis import settings
+from support import checker
 
 # Tests check the shapes and types in the signatures of these modules, which must not have been imported yet. Left out
 # are modules that numba compiles, and dataclasses that JAX fills with things other than arrays while it traces.
@@ -17,7 +18,7 @@ _CHECKED = [
     *(f"vecenv.controllers.{name}" for name in _CONTROLLERS),
     *(f"vecenv.libero.functional.{name}" for name in _FUNCTIONAL),
 ]
-jaxtyping.install_import_hook(_CHECKED, "support.checker.check")
+jaxtyping.install_import_hook(_CHECKED, f"{checker.__name__}.{checker.check.__name__}")
 
 # How long an example takes says something about the machine, nothing about the code.
 settings.register_profile("vecenv", deadline=None)

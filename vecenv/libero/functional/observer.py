@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from vecenv.libero.functional.config import PIXELS
 from vecenv.libero.functional.objectives import Objective
@@ -61,7 +62,7 @@ class Observer:
         views = {f"{PIXELS}/view_{view}": shape for view in range(len(POLICY_CAMERAS))}
         return {**({"state": (self.width,)} if self.width else {}), **views}
 
-    def __call__(self, data: Data) -> jax.Array | dict[str, jax.Array]:
+    def __call__(self, data: Data) -> Float[Array, " n"] | dict[str, jax.Array]:
         """The observation of one world: float32 [width], or with images a dictionary."""
         vector = self._vector(data) if self.width else None
         if self._tracer is None:
@@ -72,7 +73,7 @@ class Observer:
         views = {f"{PIXELS}/view_{camera}": image / jnp.float32(255) for camera, image in enumerate(rgb)}
         return views if vector is None else {"state": vector, **views}
 
-    def _vector(self, data: Data) -> jax.Array:
+    def _vector(self, data: Data) -> Float[Array, " n"]:
         """Proprioception and objects, float32 [width]; non-finite values are set to 0."""
         parts = [*(self._proprio(data) if "proprio" in self._names else ())]
         parts += self._objects(data) if "objects" in self._names else ()

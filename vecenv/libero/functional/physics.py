@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float
 from mujoco import mjx
 
 from vecenv.controllers import gripper as gripper_control
@@ -28,6 +29,7 @@ from vecenv.libero.physics.mjx import backend as mjx_physics
 from vecenv.libero.physics.mjx.backend import System, World
 from vecenv.libero.robot import ARM_DOFS, ROBOT_DOFS
 from vecenv.libero.tasks import settled as settled_starts
+from vecenv.util.arrays import AnyArray
 from vecenv.util.mapped import Sized
 
 
@@ -96,7 +98,7 @@ class WorldPhysics:
         time = jnp.asarray(settled_starts.TIME, start.qpos.dtype)
         return _kept(mjx_physics.start_world(system, world, start.qpos, start.qvel, time, jnp.asarray(True)))
 
-    def _advance(self, blank: mjx.Data, model: mjx.Model, data: Data, action: jax.Array) -> Data:
+    def _advance(self, blank: mjx.Data, model: mjx.Model, data: Data, action: Float[Array, " n"]) -> Data:
         full = blank.replace(**{name: getattr(data, name) for name in PHYSICS_FIELDS})
         after = self._act(self._system(model), data.world._replace(data=full), action)
         return _kept(after).replace(start_height=data.start_height)
@@ -108,7 +110,7 @@ def _kept(world: World) -> Data:
     return Data(**physics, world=world._replace(data=None), start_height=jnp.zeros_like(world.data.qpos[0]))
 
 
-def joint_step(system: System, world: World, action: jax.Array, *, limits: Any) -> World:
+def joint_step(system: System, world: World, action: Float[AnyArray, "8"], *, limits: Float[AnyArray, "2 7"]) -> World:
     """One control step of one world under joint control: 25 substeps, 50 ms.
 
     Args:
@@ -121,7 +123,7 @@ def joint_step(system: System, world: World, action: jax.Array, *, limits: Any) 
         return _joint_step(system, world, jnp.asarray(action, world.gripper.dtype), jnp.asarray(limits))
 
 
-def _joint_step(system: System, world: World, action: jax.Array, limits: jax.Array) -> World:
+def _joint_step(system: System, world: World, action: Float[Array, "8"], limits: Float[Array, "2 7"]) -> World:
     model = system.model.replace(body_pos=world.body_pos, body_quat=world.body_quat)
     goal = joint_control.set_goal(world.data.qpos[:ARM_DOFS], action[:ARM_DOFS], limits.astype(action.dtype))
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from vecenv.libero.functional.objectives import View
 from vecenv.libero.physics.mjx.backend import World
@@ -35,20 +36,20 @@ class Data:
         start_height: height of the target's origin when the episode began, metres.
     """
 
-    qpos: jax.Array
-    qvel: jax.Array
-    time: jax.Array
-    ctrl: jax.Array
-    qacc_warmstart: jax.Array
-    xpos: jax.Array
-    xquat: jax.Array
-    geom_xpos: jax.Array
-    geom_xmat: jax.Array
-    site_xpos: jax.Array
-    site_xmat: jax.Array
-    sensordata: jax.Array
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    time: Float[Array, ""]
+    ctrl: Float[Array, " nu"]
+    qacc_warmstart: Float[Array, " nv"]
+    xpos: Float[Array, "nbody 3"]
+    xquat: Float[Array, "nbody 4"]
+    geom_xpos: Float[Array, "ngeom 3"]
+    geom_xmat: Float[Array, "ngeom 3 3"]
+    site_xpos: Float[Array, "nsite 3"]
+    site_xmat: Float[Array, "nsite 3 3"]
+    sensordata: Float[Array, " nsensordata"]
     world: World
-    start_height: jax.Array
+    start_height: Float[Array, ""]
 
     def replace(self, **changes: Any) -> Data:
         """A copy with some fields replaced."""
@@ -108,8 +109,8 @@ class FunctionalState:
 
     data: Data
     obs: Any
-    reward: jax.Array
-    done: jax.Array
+    reward: Float[Array, ""]
+    done: Float[Array, ""]
     metrics: dict[str, jax.Array]
     info: dict[str, Any]
 
