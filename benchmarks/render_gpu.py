@@ -25,7 +25,7 @@ from common import report
 from jax import lax
 from mjx import alternate, timed_first
 
-from vecenv.libero.functional import FunctionalConfig, LiberoEnv, jit
+from vecenv.libero.functional import FunctionalConfig, FunctionalLibero, jit
 from vecenv.libero.render.options import POLICY_CAMERAS
 from vecenv.libero.render.raytrace import RayTracer
 from vecenv.libero.render.scenery import Scenery
@@ -70,14 +70,14 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def environment(scene: str, options: argparse.Namespace) -> LiberoEnv:
+def environment(scene: str, options: argparse.Namespace) -> FunctionalLibero:
     """The functional environment of ``suite/task``."""
     suite, task = scene.rsplit("/", 1)
     config = FunctionalConfig(impl="warp", geometry=options.geometry, scenes=options.scenes)
-    return LiberoEnv(suite, task=int(task), config=config)
+    return FunctionalLibero(suite, task=int(task), config=config)
 
 
-def measure(env: LiberoEnv, size: int, batch: int, options: argparse.Namespace) -> dict[str, Any]:
+def measure(env: FunctionalLibero, size: int, batch: int, options: argparse.Namespace) -> dict[str, Any]:
     """One row."""
     scenery = Scenery.load(options.sceneries / f"{env.suite}_{env.task}.npz")
     tracer = RayTracer(scenery, height=size, width=size, samples=options.samples)
@@ -116,7 +116,7 @@ class Loops:
     What a loop returns depends on every pixel, as a policy would.
     """
 
-    def __init__(self, env: LiberoEnv, tracer: RayTracer, batch: int) -> None:
+    def __init__(self, env: FunctionalLibero, tracer: RayTracer, batch: int) -> None:
         keys = jax.random.split(jax.random.key(0), batch)
         step, self._look = jax.vmap(env.step), jax.vmap(tracer.look)
         self._state = jit(jax.vmap(env.reset))(keys)

@@ -34,13 +34,13 @@ MODES = ("forward", "reverse")
 SIZES, SIZES_FLOAT32 = (1e-4,) * 3 + (3e-4,) * 4, (0.02,) * 7
 
 
-def make_env(suite: str, task: int, scenes: str | None = None) -> functional.LiberoEnv:
+def make_env(suite: str, task: int, scenes: str | None = None) -> functional.FunctionalLibero:
     """A task in pure JAX."""
     options = {"impl": "jax", "geometry": "lean", "objective": "reach", "scenes": scenes}
-    return functional.LiberoEnv(suite, task=task, config_overrides=options)
+    return functional.FunctionalLibero(suite, task=task, config_overrides=options)
 
 
-def rollout(env: functional.LiberoEnv, state: functional.State, actions: jax.Array) -> jax.Array:
+def rollout(env: functional.FunctionalLibero, state: functional.FunctionalState, actions: jax.Array) -> jax.Array:
     """Distance between hand and target, metres, after some actions, [T, 7]."""
     state, _ = jax.lax.scan(lambda state, action: (env.step(state, action), None), state, actions)
     target = env.mj_model.body(env.scene.entities[env.target].root_body).id
@@ -48,7 +48,7 @@ def rollout(env: functional.LiberoEnv, state: functional.State, actions: jax.Arr
 
 
 def derivatives(
-    env: functional.LiberoEnv, state: functional.State, actions: jax.Array, mode: str
+    env: functional.FunctionalLibero, state: functional.FunctionalState, actions: jax.Array, mode: str
 ) -> tuple[jax.Array, Callable[[jax.Array], jax.Array]]:
     """Derivatives [T, 7] of the distance, and the distance itself as a function of the actions.
 
@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0 if compare(env, args) else 1
 
 
-def compare(env: functional.LiberoEnv, args: argparse.Namespace) -> bool:
+def compare(env: functional.FunctionalLibero, args: argparse.Namespace) -> bool:
     """Print the table; whether derivatives and differences agree."""
     state = functional.jit(env.reset)(jax.random.key(args.seed))
     # Away from -1 and 1, where actions are clipped, and from the gripper's 0.

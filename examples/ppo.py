@@ -655,18 +655,18 @@ class Upright:
 
     action_size = 4
 
-    def __init__(self, env: functional.LiberoEnv) -> None:
+    def __init__(self, env: functional.FunctionalLibero) -> None:
         self._env, self.observation_size, self.reset = env, env.observation_size, env.reset
 
-    def step(self, state: functional.State, action: jax.Array) -> functional.State:
+    def step(self, state: functional.FunctionalState, action: jax.Array) -> functional.FunctionalState:
         """Advance by one step; ``action`` is [4]."""
         return self._env.step(state, jnp.zeros(7, action.dtype).at[jnp.array([0, 1, 2, 6])].set(action))
 
 
-def make_env(args: argparse.Namespace) -> functional.LiberoEnv:
+def make_env(args: argparse.Namespace) -> functional.FunctionalLibero:
     """The task that the command line asks for, with the shaped reward."""
     same = ("objective", "target", "geometry", "placement", "scenes", "episode_length")
-    return functional.LiberoEnv(
+    return functional.FunctionalLibero(
         args.suite,
         task=args.task,
         config_overrides={
@@ -718,7 +718,7 @@ def _frozen(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _result(env: functional.LiberoEnv, config: PPOConfig, trained: Trained) -> dict[str, Any]:
+def _result(env: functional.FunctionalLibero, config: PPOConfig, trained: Trained) -> dict[str, Any]:
     last = trained.rows[-1]
     return {
         "success_without_noise": trained.success,

@@ -26,8 +26,8 @@ from vecenv.libero.env import SETTLE_ACTION, LiberoEnv, make
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import SceneKey
 from vecenv.libero.scene.lean import geometry, recipes
-from vecenv.libero.scene.lean import primitives as fits
-from vecenv.libero.scene.lean.primitives import Solid
+from vecenv.libero.scene.lean import solids as shapes
+from vecenv.libero.scene.lean.solids import Solid
 from vecenv.libero.scene.scene import Scene, scene_source
 from vecenv.libero.tasks import suites
 
@@ -42,9 +42,9 @@ MAX_STEPS = 500
 # Contacts that MJX reserves for a pair.
 CONTACTS = {"plane-box": 4, "box-box": 4, "capsule-box": 2, "plane-capsule": 2, "capsule-capsule": 1}
 _TYPES = {
-    fits.BOX: mujoco.mjtGeom.mjGEOM_BOX,
-    fits.CAPSULE: mujoco.mjtGeom.mjGEOM_CAPSULE,
-    fits.CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
+    shapes.BOX: mujoco.mjtGeom.mjGEOM_BOX,
+    shapes.CAPSULE: mujoco.mjtGeom.mjGEOM_CAPSULE,
+    shapes.CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
 # Solids and their colour, RGBA.
 _Group: TypeAlias = tuple[Sequence[Solid], tuple[float, ...]]
@@ -292,7 +292,7 @@ def described(exact: Sequence[Solid], lean: Sequence[Solid]) -> str:
     """Number of geoms, and mean distances of the exact surface from the lean one and back, millimetres."""
     if not lean:
         return "0"
-    there, back = (MILLIMETRES * fits.gaps(*pair).mean() for pair in ((exact, lean), (lean, exact)))
+    there, back = (MILLIMETRES * shapes.gaps(*pair).mean() for pair in ((exact, lean), (lean, exact)))
     return f"{len(lean)} ({there:.1f}, {back:.1f})"
 
 

@@ -5,8 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import jaxtyping
 import pytest
 from hypothesis import settings
+from support import checker
+
+# Tests check the shapes and types in the signatures of these modules, which must not have been imported yet. Left out
+# are modules that numba compiles, and dataclasses that JAX fills with things other than arrays while it traces.
+_CONTROLLERS = ("_batch_last", "chain", "gripper", "interpolate", "joint", "kinematics", "osc", "waypoint")
+_FUNCTIONAL = ("config", "env", "objectives", "observer", "physics", "randomize", "starts")
+_CHECKED = [
+    *(f"vecenv.controllers.{name}" for name in _CONTROLLERS),
+    *(f"vecenv.libero.functional.{name}" for name in _FUNCTIONAL),
+]
+jaxtyping.install_import_hook(_CHECKED, f"{checker.__name__}.{checker.check.__name__}")
 
 # How long an example takes says something about the machine, nothing about the code.
 settings.register_profile("vecenv", deadline=None)
@@ -21,6 +33,14 @@ def _cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VECENV_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture
+def unchecked_shapes() -> Iterator[None]:
+    """Signatures are not checked, as outside of tests: a wrong shape reaches the function, whose own error counts."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from vecenv.contract import ACTION_DIM, EE_POSE_DIM
-from vecenv.controllers.waypoint import Plan, Pose
+from vecenv.controllers.waypoint import Pose, WaypointPlan
 from vecenv.errors import InvalidInput
 
 _NO_LENGTH = 1e-6
@@ -144,7 +144,7 @@ def ee_poses(value: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray, tuple[s
     return clean, finite & unit, errors
 
 
-def plan(value: Any, num_envs: int) -> tuple[Plan, tuple[str, ...]]:
+def plan(value: Any, num_envs: int) -> tuple[WaypointPlan, tuple[str, ...]]:
     """Validate the input of ``step_waypoints``.
 
     Args:
@@ -168,7 +168,7 @@ def plan(value: Any, num_envs: int) -> tuple[Plan, tuple[str, ...]]:
     reasons = np.where(wanted, np.array(problems, object).reshape(shape), "")
     errors = tuple("; ".join(f"waypoint {t}: {reason}" for t, reason in enumerate(row) if reason) for row in reasons)
     pose = Pose(clean[..., :3], clean[..., 3:7])
-    return Plan(pose, clean[..., 7], holds, wanted & usable.reshape(shape)), errors
+    return WaypointPlan(pose, clean[..., 7], holds, wanted & usable.reshape(shape)), errors
 
 
 def _plan_field(value: Any, name: str, num_envs: int, tail: tuple[int, ...], count: int | None = None) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from vecenv import actions as action_space
 from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo, Watcher
-from vecenv.controllers.waypoint import Plan
+from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.placement import Placement
 
 _Kind = TypeVar("_Kind", bound=Control)
@@ -74,7 +74,7 @@ class SlotBatch(ABC):
         """
 
     @abstractmethod
-    def _follow(self, plan: Plan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _follow(self, plan: WaypointPlan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Follow a plan; returns rewards [B], and of each waypoint who arrived, bool [B, T], and its ticks [B, T]."""
 
     @abstractmethod

@@ -51,6 +51,7 @@ def test_slots_are_independent_for_any_leading_axes() -> None:
     np.testing.assert_array_equal(jax.vmap(jax.vmap(gripper.integrate))(state, action), moved)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_wrong_shapes_are_named() -> None:
     with pytest.raises(ValueError, match=r"gripper state must have shape \[\.\.\., 2\], got \[3\]"):
         gripper.integrate(jnp.zeros(3), jnp.zeros(()))

@@ -12,7 +12,7 @@ import pytest
 
 from vecenv.controllers import joint, kinematics
 from vecenv.controllers.osc import ArmState
-from vecenv.libero.scene.scene import HOME_QPOS
+from vecenv.libero.robot import HOME_QPOS, panda_chain
 from vecenv.libero.tasks.sources import installed_tasks
 
 compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -40,6 +40,7 @@ def test_torques_and_goals_stay_within_limits() -> None:
     np.testing.assert_allclose(goal, [0.05, 1.0, -1.0, 0.025, 0, 0, 0], atol=1e-6)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="action"):
         joint.set_goal(jnp.zeros(7), jnp.zeros(8), jnp.zeros((2, 7)))
@@ -47,7 +48,7 @@ def test_wrong_shapes_are_refused() -> None:
 
 def test_the_arm_holds_still_and_goes_where_it_is_told() -> None:
     model = installed_tasks("libero_object")[0].scene(()).model
-    chain = kinematics.chain_from_model(model)
+    chain = panda_chain(model)
 
     @compiled
     def control(qpos: jax.Array, qvel: jax.Array, goal: jax.Array) -> jax.Array:

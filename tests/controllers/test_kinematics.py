@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from vecenv.controllers import osc
-from vecenv.controllers.kinematics import Chain, arm_state, chain_from_model, hand_pose
+from vecenv.controllers.chain import chain_from_model
+from vecenv.controllers.kinematics import Chain, arm_state, hand_pose
 from vecenv.libero.physics.mjx import backend as mjx
-from vecenv.libero.scene.scene import GRIP_SITE, HAND_BODY, HOME_QPOS
+from vecenv.libero.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, HAND_BODY, HOME_QPOS, panda_chain
 from vecenv.libero.tasks.sources import installed_tasks
 
 # The options the library uses, and the same without LLVM's optimisation, which compile 5 times faster.
@@ -35,7 +36,7 @@ def scene_model(suite: str) -> mujoco.MjModel:
 
 @pytest.fixture(scope="module")
 def chain() -> Chain:
-    return chain_from_model(scene_model("libero_spatial"))
+    return panda_chain(scene_model("libero_spatial"))
 
 
 class States(NamedTuple):
@@ -103,11 +104,11 @@ def assert_equal(found: Truth, truth: Truth) -> None:
 def test_500_random_states_of_a_scene_equal_mujocos(suite: str) -> None:
     model = scene_model(suite)
     states = states_of(model)
-    assert_equal(found_of(chain_from_model(model), states), truth_of(model, states))
+    assert_equal(found_of(panda_chain(model), states), truth_of(model, states))
 
 
 def test_the_base_is_where_the_scene_puts_it() -> None:
-    floor, table = (chain_from_model(scene_model(suite)) for suite in SUITES)
+    floor, table = (panda_chain(scene_model(suite)) for suite in SUITES)
     bases = [scene_model(suite).body("robot0_base").pos for suite in SUITES]
     assert np.abs(bases[0] - bases[1]).max() > 0.5
     np.testing.assert_allclose(np.subtract(table.base, floor.base), bases[1] - bases[0], atol=1e-15)
@@ -151,14 +152,14 @@ def test_a_robot_with_nothing_aligned_equals_mujocos() -> None:
     model = mujoco.MjModel.from_xml_string(made_up_robot())
     rng = np.random.default_rng(1)
     states = States(rng.uniform(-3, 3, (COUNT, 9)), rng.normal(size=(COUNT, 9)))
-    assert_equal(found_of(chain_from_model(model), states), truth_of(model, states))
+    assert_equal(found_of(panda_chain(model), states), truth_of(model, states))
 
 
 def test_without_gravity_there_is_none() -> None:
     model = mujoco.MjModel.from_xml_string(made_up_robot())
-    assert np.any(chain_from_model(model).gravity)
+    assert np.any(panda_chain(model).gravity)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
-    assert not np.any(chain_from_model(model).gravity)
+    assert not np.any(panda_chain(model).gravity)
 
 
 # float32 ------------------------------------------------------------------------------------------------------------
@@ -214,9 +215,9 @@ def test_any_leading_axes_give_the_same(chain: Chain) -> None:
 
 def test_under_vmap_and_scan_masses_may_differ_between_slots() -> None:
     model = mujoco.MjModel.from_xml_string(made_up_robot())
-    states, light = States(*np.random.default_rng(2).normal(size=(2, COUNT, 9))), chain_from_model(model)
+    states, light = States(*np.random.default_rng(2).normal(size=(2, COUNT, 9))), panda_chain(model)
     model.body_mass[model.body("link7").id] += 2.0
-    heavy = chain_from_model(model)
+    heavy = panda_chain(model)
 
     def scanned(chain: Chain) -> osc.ArmState:
         return jax.lax.scan(lambda _, state: (None, arm_state(chain, *state)), None, states)[1]
@@ -345,17 +346,24 @@ def test_a_robot_built_otherwise_is_refused(old: str, new: str, message: str) ->
     xml = made_up_robot()
     assert old in xml
     with pytest.raises(ValueError, match=message):
-        chain_from_model(mujoco.MjModel.from_xml_string(xml.replace(old, new)))
+        panda_chain(mujoco.MjModel.from_xml_string(xml.replace(old, new)))
 
 
 def test_names_of_the_wrong_number_or_place_are_refused() -> None:
     model = mujoco.MjModel.from_xml_string(made_up_robot())
+    names: dict[str, Any] = {
+        "arm_joints": ARM_JOINTS,
+        "finger_joints": FINGER_JOINTS,
+        "site": GRIP_SITE,
+        "hand": HAND_BODY,
+    }
     with pytest.raises(ValueError, match="need 7 arm joints and 2 finger joints"):
-        chain_from_model(model, arm_joints=["robot0_joint1"])
+        chain_from_model(model, **{**names, "arm_joints": ["robot0_joint1"]})
     with pytest.raises(ValueError, match="body 'link6' must be fixed to the link of joint 'robot0_joint7'"):
-        chain_from_model(model, hand="link6")
+        chain_from_model(model, **{**names, "hand": "link6"})
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_wrong_shapes_are_named(chain: Chain) -> None:
     with pytest.raises(ValueError, match=r"qvel must have shape \[..., 9\], got \[2, 7\]"):
         arm_state(chain, np.zeros((2, 9)), np.zeros((2, 7)))

@@ -240,6 +240,7 @@ def test_gradients_are_finite_at_rest_at_zero_rotation_and_in_singular_arms(case
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_wrong_shapes_are_named() -> None:
     arm = osc.ArmState(*(jnp.zeros((2, *tail)) for tail in ((7,), (7,), (3,), (3, 3), (6, 7), (7, 7), (7,))))
     goal = osc.hold_goal(arm)

@@ -152,6 +152,7 @@ def test_gradients_are_finite_at_the_target() -> None:
     assert np.isfinite(slope).all()
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_wrong_shapes_are_named() -> None:
     here = pose([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=r"waypoint must have shape \[\.\.\., 8\], got \[7\]"):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from vecenv.libero import functional
-from vecenv.libero.functional.env import FunctionalError
+from vecenv.libero.functional import FunctionalError
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.mjx import backend as mjx
 
@@ -48,7 +48,7 @@ def test_the_registry_loads_a_task_with_its_options() -> None:
     playground.register(["libero_object"])
     env = registry.load(NAME, config_overrides={"impl": "warp", "obs": "proprio"})
     assert isinstance(env, MjxEnv)
-    assert isinstance(env, functional.LiberoEnv)
+    assert isinstance(env, functional.FunctionalLibero)
     assert (env.suite, env.task, env.config.obs) == ("libero_object", 0, "proprio")
     assert (env.dt, env.sim_dt, env.n_substeps) == (0.05, 0.002, 25)
     assert (env.action_size, env.observation_size) == (7, 25)
@@ -83,7 +83,7 @@ def test_starts_rotate_with_full_resets_and_only_then(env: playground.Playground
 
 
 def test_the_functional_environment_itself_goes_through_the_wrapper() -> None:
-    env = functional.LiberoEnv("libero_object", task=0, config_overrides={"impl": "warp", "budget": BUDGET})
+    env = functional.FunctionalLibero("libero_object", task=0, config_overrides={"impl": "warp", "budget": BUDGET})
     wrapped = playground.wrap_for_training(env, episode_length=5)
     first = jax.eval_shape(wrapped.reset, jax.random.split(jax.random.PRNGKey(0), WORLDS))
     then = jax.eval_shape(wrapped.step, first, jax.ShapeDtypeStruct((WORLDS, 7), jnp.float32))

@@ -13,7 +13,7 @@ import vecenv
 from vecenv.actions import ActionError
 from vecenv.contract import BatchEnv, ImagesUnavailable
 from vecenv.libero.env import LiberoEnv, LiberoError
-from vecenv.libero.scene import scene as scene_module
+from vecenv.libero.scene import elements
 from vecenv.libero.tasks import sources
 from vecenv.placement import PlacementError
 
@@ -310,7 +310,7 @@ class TestFaults:
 
     def test_exhausted_memory_is_a_fault(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a log file where the process stands.
-        monkeypatch.setattr(scene_module, "ARENA_MEMORY", "230K")
+        monkeypatch.setattr(elements, "ARENA_MEMORY", "230K")
         sources.compiled.cache_clear()
         try:
             env = make()

@@ -72,6 +72,13 @@ def test_the_rotation_between_takes_the_short_way(quats: np.ndarray) -> None:
     np.testing.assert_allclose(signs, error, atol=1e-12)
 
 
+def test_vectors_are_turned_as_scipy_turns_them(quats: np.ndarray) -> None:
+    vectors = np.random.default_rng(5).normal(size=(len(quats), 3))
+    with jax.enable_x64(True):
+        turned = rotations.rotate(quats, vectors)
+    np.testing.assert_allclose(turned, scipy_of(quats).apply(vectors), atol=1e-13)
+
+
 def test_quaternions_without_a_direction_are_masked() -> None:
     quat = np.array([[2.0, 0, 0, 0], [0, 0, 0, 0], [np.nan, 1, 0, 0], [np.inf, 0, 0, 1], [1e-30, 0, 0, -1e-30]])
     unit, valid = rotations.quat_normalize(jnp.asarray(quat, jnp.float32))

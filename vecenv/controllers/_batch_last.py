@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Array, Float
 
 
 def fenced_on_cpu(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
@@ -41,7 +42,7 @@ def stage(fence: bool, function: Callable[..., Any], *args: Any) -> Any:
         return jax.jit(without_mark)(*args)
 
 
-def sum_rows(x: jax.Array) -> jax.Array:
+def sum_rows(x: Float[Array, k * B]) -> Float[Array, "*B"]:
     """Sum of [k, ...] over axis 0 in a fixed order, elementwise over the rest."""
     total = x[0]
     for i in range(1, x.shape[0]):
@@ -49,6 +50,6 @@ def sum_rows(x: jax.Array) -> jax.Array:
     return total
 
 
-def cross(a: jax.Array, b: jax.Array) -> jax.Array:
+def cross(a: Float[Array, "3 *#B"], b: Float[Array, "3 *#B"]) -> Float[Array, "3 *#B"]:
     """Cross product of [3, ...] with [3, ...]."""
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

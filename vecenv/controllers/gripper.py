@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Real
 
+from vecenv.util.arrays import AnyArray
 from vecenv.util.rotations import require_tail
 
 
@@ -36,7 +37,9 @@ PANDA_GRIPPER = GripperConfig()
 _CLOSING = (-1.0, 1.0)
 
 
-def integrate(state: jax.Array, action: jax.Array, config: GripperConfig = PANDA_GRIPPER) -> jax.Array:
+def integrate(
+    state: Float[AnyArray, "*#B 2"], action: Real[AnyArray, "*#B"], config: GripperConfig = PANDA_GRIPPER
+) -> Float[Array, "... 2"]:
     """Advance the gripper state by one physics substep.
 
     Args:
@@ -57,7 +60,7 @@ def integrate(state: jax.Array, action: jax.Array, config: GripperConfig = PANDA
     return jnp.clip(state + step * direction[..., None], -1, 1)
 
 
-def command(state: jax.Array, config: GripperConfig = PANDA_GRIPPER) -> jax.Array:
+def command(state: Float[AnyArray, "*B 2"], config: GripperConfig = PANDA_GRIPPER) -> Float[Array, "*B 2"]:
     """Position targets of the finger actuators.
 
     Args:

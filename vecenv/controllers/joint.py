@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from vecenv.controllers.osc import OSC_POSE, ArmState
+from vecenv.util.arrays import AnyArray
 from vecenv.util.rotations import require_tail
 
 
@@ -37,7 +38,12 @@ class JointConfig:
 JOINT_POSITION = JointConfig()
 
 
-def set_goal(qpos: jax.Array, action: jax.Array, limits: jax.Array, config: JointConfig = JOINT_POSITION) -> jax.Array:
+def set_goal(
+    qpos: Float[AnyArray, "*#B 7"],
+    action: Float[AnyArray, "*#B 7"],
+    limits: Float[AnyArray, "2 7"],
+    config: JointConfig = JOINT_POSITION,
+) -> Float[Array, "... 7"]:
     """Target angles, radians, [..., 7].
 
     Args:
@@ -55,7 +61,9 @@ def set_goal(qpos: jax.Array, action: jax.Array, limits: jax.Array, config: Join
     return jnp.clip(qpos + config.max_delta * jnp.clip(action, -1, 1), limits[0], limits[1])
 
 
-def torques(arm: ArmState, goal: jax.Array, config: JointConfig = JOINT_POSITION) -> jax.Array:
+def torques(
+    arm: ArmState, goal: Float[AnyArray, "*B 7"], config: JointConfig = JOINT_POSITION
+) -> Float[Array, "... 7"]:
     """Torques that pull the joints to their targets, clipped to the limits, N·m, [..., 7].
 
     Args:

@@ -1,10 +1,10 @@
 """Kinematics and dynamics of the robot alone, from its joint state: what the controller reads, without a simulator.
 
-In: constants of the arm and its two fingers, read once from a compiled model (``chain_from_model``), and joint
-positions and velocities [..., 9]. Out: the ``ArmState`` that ``osc.torques`` takes (``arm_state``), and the pose that
-proprioception reports (``hand_pose``). The numbers are those of MuJoCo's ``mj_forward``: ``site_xpos``, ``site_xmat``,
-``mj_jacSite``, the mass matrix, ``qfrc_bias``, ``xquat``. So the controller can run before the physics step of any
-simulator, inside ``jit``, at the cost of one arm instead of a whole scene.
+In: constants of the arm and its two fingers (``Chain``, which ``chain.chain_from_model`` reads from a compiled model),
+and joint positions and velocities [..., 9]. Out: the ``ArmState`` that ``osc.torques`` takes (``arm_state``), and the
+pose that proprioception reports (``hand_pose``). The numbers are those of MuJoCo's ``mj_forward``: ``site_xpos``,
+``site_xmat``, ``mj_jacSite``, the mass matrix, ``qfrc_bias``, ``xquat``. So the controller can run before the physics
+step of any simulator, inside ``jit``, at the cost of one arm instead of a whole scene.
 
 How it is computed: in the configuration ``reference`` every frame is taken parallel to the world's, so a hinge turns by
 ``exp(axis angle)`` and rotations multiply along the chain (product of exponentials; Lynch and Park 2017, chapter 4).
@@ -19,19 +19,17 @@ everything is elementwise over the batch. On a CPU the work is cut into stages, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial, reduce
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
-from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
 
 from vecenv.controllers._batch_last import cross, fenced_on_cpu, stage, sum_rows
 from vecenv.controllers.osc import NUM_JOINTS, ArmState
-from vecenv.libero.scene.scene import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, HAND_BODY
+from vecenv.util.arrays import AnyArray
 from vecenv.util.rotations import require_tail
 
 NUM_FINGERS = 2
@@ -77,113 +75,7 @@ class Chain(NamedTuple):
     hand_quat: Constant
 
 
-def chain_from_model(
-    model: mujoco.MjModel,
-    *,
-    arm_joints: Sequence[str] = ARM_JOINTS,
-    finger_joints: Sequence[str] = FINGER_JOINTS,
-    site: str = GRIP_SITE,
-    hand: str = HAND_BODY,
-) -> Chain:
-    """Read the constants of an arm of seven hinges with two sliding fingers on its last link.
-
-    Args:
-        model: a compiled model whose first nine joints are the arm's and the fingers'.
-        arm_joints: names of the hinges, from the base outward.
-        finger_joints: names of the slides.
-        site: name of the controlled site.
-        hand: name of the body whose orientation is reported.
-
-    Returns:
-        The constants, float64 NumPy arrays.
-
-    Raises:
-        ValueError: a name is missing, or the robot is not built as described; the message says what is wrong.
-    """
-    names = (*arm_joints, *finger_joints)
-    if len(arm_joints) != NUM_JOINTS or len(names) != NUM_BODIES:
-        raise ValueError(f"need {NUM_JOINTS} arm joints and {NUM_FINGERS} finger joints, got {', '.join(names)}")
-    for index, name in enumerate(names):
-        _check_joint(model, name, index)
-    bodies = model.jnt_bodyid[:NUM_BODIES].tolist()
-    _check_tree(model, bodies)
-    if np.any(model.tendon_armature):
-        raise ValueError("a tendon has armature, which would add to the mass matrix")
-    site_id = _require(model, mujoco.mjtObj.mjOBJ_SITE, site)
-    hand_id = _require(model, mujoco.mjtObj.mjOBJ_BODY, hand)
-    for what, body in ((f"site {site!r}", model.site_bodyid[site_id]), (f"body {hand!r}", hand_id)):
-        if model.body_weldid[body] != bodies[NUM_JOINTS - 1]:
-            raise ValueError(f"{what} must be fixed to the link of joint {names[NUM_JOINTS - 1]!r}")
-    return _measure(model, bodies, site_id, hand_id)
-
-
-def _require(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
-    found = mujoco.mj_name2id(model, kind, name)
-    if found < 0:
-        raise ValueError(f"the model has no {kind.name.removeprefix('mjOBJ_').lower()} {name!r}")
-    return found
-
-
-def _check_joint(model: mujoco.MjModel, name: str, index: int) -> None:
-    """The joint is of the right type, and number ``index`` in the model."""
-    found = _require(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-    wanted = mujoco.mjtJoint.mjJNT_HINGE if index < NUM_JOINTS else mujoco.mjtJoint.mjJNT_SLIDE
-    if model.jnt_type[found] != wanted:
-        raise ValueError(f"joint {name!r} must be a {wanted.name.removeprefix('mjJNT_').lower()}")
-    if found != index:
-        raise ValueError(f"joint {name!r} must be number {index} of the model, it is number {found}")
-
-
-def _check_tree(model: mujoco.MjModel, bodies: Sequence[int]) -> None:
-    """Each link hangs on the one before, the first on the world, the fingers on the last, and nothing else on them."""
-    last = bodies[NUM_JOINTS - 1]
-    parents = [0, *bodies[: NUM_JOINTS - 1], last, last]
-    for joint, body in enumerate(model.jnt_bodyid):
-        name, carrier = model.joint(joint).name, model.body_weldid[model.body_parentid[body]]
-        if joint < NUM_BODIES and carrier != parents[joint]:
-            raise ValueError(f"joint {name!r} must move against body {model.body(parents[joint]).name!r}")
-        if joint >= NUM_BODIES and carrier in bodies:
-            raise ValueError(f"joint {name!r} hangs on the robot, which may have no more than {NUM_BODIES} joints")
-
-
-def _measure(model: mujoco.MjModel, bodies: Sequence[int], site: int, hand: int) -> Chain:
-    """The constants as MuJoCo's kinematics shows them in the reference configuration."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = model.qpos0
-    mujoco.mj_kinematics(model, data)
-    hinge = data.xanchor[:NUM_JOINTS]
-    parts = [_welded_together(model, data, body) for body in bodies]
-    weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
-    return Chain(
-        reference=model.qpos0[:NUM_BODIES].copy(),
-        base=hinge[0].copy(),
-        axis=data.xaxis[:NUM_JOINTS].copy(),
-        offset=np.diff(hinge, axis=0),
-        slide=data.xaxis[NUM_JOINTS:NUM_BODIES].copy(),
-        mass=np.array([mass for mass, _, _ in parts]),
-        com=np.array([com for _, com, _ in parts]) - hinge[[*range(NUM_JOINTS), *[-1] * NUM_FINGERS]],
-        inertia=np.array([inertia for _, _, inertia in parts]),
-        armature=model.dof_armature[:NUM_JOINTS].copy(),
-        gravity=np.zeros(3) if weightless else model.opt.gravity.copy(),
-        site_offset=data.site_xpos[site] - hinge[-1],
-        site_axes=data.site_xmat[site].reshape(3, 3).T.copy(),
-        hand_quat=data.xquat[hand].copy(),
-    )
-
-
-def _welded_together(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass [3] and inertia about it [3, 3] of a moving body and all that is fixed to it."""
-    parts = np.flatnonzero(model.body_weldid == body)
-    mass = model.body_mass[parts]
-    com = mass @ data.xipos[parts] / mass.sum()
-    inertia = np.zeros((3, 3))
-    for part, m in zip(parts, mass, strict=True):
-        axes, arm = data.ximat[part].reshape(3, 3), data.xipos[part] - com
-        inertia += (axes * model.body_inertia[part]) @ axes.T + m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return float(mass.sum()), com, inertia
-
-
-def arm_state(chain: Chain, qpos: ArrayLike, qvel: ArrayLike) -> ArmState:
+def arm_state(chain: Chain, qpos: Real[AnyArray, "*#B 9"], qvel: Real[AnyArray, "*#B 9"]) -> ArmState:
     """What the controller reads of the arm.
 
     Args:
@@ -205,7 +97,7 @@ def arm_state(chain: Chain, qpos: ArrayLike, qvel: ArrayLike) -> ArmState:
     return ArmState(qpos[..., :NUM_JOINTS], qvel[..., :NUM_JOINTS], *map(_batch_first, found, (1, 2, 2, 2, 1)))
 
 
-def hand_pose(chain: Chain, qpos: ArrayLike) -> tuple[jax.Array, jax.Array]:
+def hand_pose(chain: Chain, qpos: Real[AnyArray, "*B 9"]) -> tuple[Float[Array, "*B 3"], Float[Array, "*B 4"]]:
     """What proprioception reports of the hand.
 
     Args:
@@ -224,7 +116,7 @@ def hand_pose(chain: Chain, qpos: ArrayLike) -> tuple[jax.Array, jax.Array]:
     return _batch_first(pos, 1), _batch_first(quat, 1)
 
 
-def _checked(name: str, value: ArrayLike) -> jax.Array:
+def _checked(name: str, value: AnyArray) -> jax.Array:
     array = jnp.asarray(value)
     require_tail(name, array, (NUM_BODIES,))
     return array.astype(jnp.result_type(array, 0.0))
@@ -255,27 +147,37 @@ class _Frames(NamedTuple):
         eef: position of the controlled site, [3, ...].
     """
 
-    mat: jax.Array
-    pos: jax.Array
-    eef: jax.Array
+    mat: Float[Array, "3 3 7 *B"]
+    pos: Float[Array, "3 7 *B"]
+    eef: Float[Array, 3 * B]
 
 
 class _Inertias(NamedTuple):
     """Spatial inertias of k bodies: mass [k, ...], mass times centre [3, k, ...], second moments [3, 3, k, ...]."""
 
-    mass: jax.Array
-    first: jax.Array
-    second: jax.Array
+    mass: Float[Array, k * B]
+    first: Float[Array, "3 k *B"]
+    second: Float[Array, "3 3 k *B"]
 
 
-def _hand_last(chain: Chain, qpos: jax.Array, *, fence: bool) -> tuple[jax.Array, jax.Array]:
+def _hand_last(
+    chain: Chain, qpos: Float[Array, 9 * B], *, fence: bool
+) -> tuple[Float[Array, 3 * B], Float[Array, 4 * B]]:
     """Position of the site and orientation of the hand."""
     turns = stage(fence, _hinge_quats, chain, qpos)
     turn = reduce(partial(stage, fence, _quat_product), [turns[:, i] for i in range(NUM_JOINTS)])
     return chain.base + _frames(chain, qpos, fence).eef, _quat_product(turn, chain.hand_quat)
 
 
-def _arm_last(chain: Chain, qpos: jax.Array, qvel: jax.Array, *, fence: bool) -> tuple[jax.Array, ...]:
+def _arm_last(
+    chain: Chain, qpos: Float[Array, 9 * B], qvel: Float[Array, 9 * B], *, fence: bool
+) -> tuple[
+    Float[Array, 3 * B],
+    Float[Array, "3 3 *B"],
+    Float[Array, "6 7 *B"],
+    Float[Array, "7 7 *B"],
+    Float[Array, 7 * B],
+]:
     """Position and orientation of the site, Jacobian, mass matrix and bias."""
     frames = _frames(chain, qpos, fence)
     pos, mat, jacobian, screws = stage(fence, _site, chain, frames)
@@ -286,14 +188,14 @@ def _arm_last(chain: Chain, qpos: jax.Array, qvel: jax.Array, *, fence: bool) ->
     return pos, mat, jacobian, mass_matrix, stage(fence, _project, screws, force)
 
 
-def _frames(chain: Chain, qpos: jax.Array, fence: bool) -> _Frames:
+def _frames(chain: Chain, qpos: Float[Array, 9 * B], fence: bool) -> _Frames:
     mat = stage(fence, _hinge_mats, chain, qpos)
     for reach in (1, 2, 4):
         mat = stage(fence, partial(_compose, reach=reach), mat)
     return stage(fence, _place, chain, mat)
 
 
-def _hinge_mats(chain: Chain, qpos: jax.Array) -> jax.Array:
+def _hinge_mats(chain: Chain, qpos: Float[Array, 9 * B]) -> Float[Array, "3 3 7 *B"]:
     """Rotation of each hinge since the reference configuration, [3, 3, 7, ...] (Rodrigues' formula).
 
     Matrices, not quaternions: in float32 the site's position is then off by 4e-8 m instead of 6e-8 (root mean square).
@@ -304,40 +206,40 @@ def _hinge_mats(chain: Chain, qpos: jax.Array) -> jax.Array:
     return along + jnp.cos(angle) * (columns - along) + jnp.sin(angle) * cross(chain.axis[:, None], columns)
 
 
-def _compose(mat: jax.Array, *, reach: int) -> jax.Array:
+def _compose(mat: Float[Array, "3 3 7 *B"], *, reach: int) -> Float[Array, "3 3 7 *B"]:
     """Multiply onto each rotation the one ``reach`` hinges before it; after 1, 2 and 4, each holds all before it."""
     return jnp.concatenate([mat[:, :, :reach], _product(mat[:, :, :-reach], mat[:, :, reach:])], axis=2)
 
 
-def _hinge_quats(chain: Chain, qpos: jax.Array) -> jax.Array:
+def _hinge_quats(chain: Chain, qpos: Float[Array, 9 * B]) -> Float[Array, "4 7 *B"]:
     """The same as quaternions, [4, 7, ...]."""
     half = 0.5 * (qpos - chain.reference)[:NUM_JOINTS]
     return jnp.concatenate([jnp.cos(half)[None], chain.axis * jnp.sin(half)])
 
 
-def _quat_product(a: jax.Array, b: jax.Array) -> jax.Array:
+def _quat_product(a: Float[Array, "4 *#B"], b: Float[Array, "4 *#B"]) -> Float[Array, "4 *#B"]:
     """Hamilton product of quaternions [4, ...]."""
     scalar = a[0] * b[0] - sum_rows(a[1:] * b[1:])
     return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:])])
 
 
-def _rotate(mat: jax.Array, v: jax.Array) -> jax.Array:
+def _rotate(mat: Float[Array, "3 3 *#B"], v: Float[Array, "3 *#B"]) -> Float[Array, "3 *#B"]:
     """Matrices [3, 3, ...] times vectors [3, ...]."""
     return mat[:, 0] * v[0] + mat[:, 1] * v[1] + mat[:, 2] * v[2]
 
 
-def _product(a: jax.Array, b: jax.Array) -> jax.Array:
+def _product(a: Float[Array, "3 3 *#B"], b: Float[Array, "3 3 *#B"]) -> Float[Array, "3 3 *#B"]:
     """Matrices [3, 3, ...] times matrices [3, 3, ...]."""
     return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
 
 
-def _place(chain: Chain, mat: jax.Array) -> _Frames:
+def _place(chain: Chain, mat: Float[Array, "3 3 7 *B"]) -> _Frames:
     steps = _rotate(mat[:, :, :-1], chain.offset)
     pos = _running_sum(jnp.concatenate([jnp.zeros_like(steps[:, :1]), steps], axis=1))
     return _Frames(mat, pos, pos[:, -1] + _rotate(mat[:, :, -1], chain.site_offset))
 
 
-def _running_sum(x: jax.Array) -> jax.Array:
+def _running_sum(x: Float[Array, "c k *B"]) -> Float[Array, "c k *B"]:
     """Along axis 1, the sum of all entries up to each."""
     sums = [x[:, 0]]
     for i in range(1, x.shape[1]):
@@ -356,7 +258,7 @@ def _site(chain: Chain, frames: _Frames) -> tuple[jax.Array, jax.Array, jax.Arra
     return chain.base + frames.eef, mat, jacobian, jnp.concatenate([axis, cross(frames.pos, axis)])
 
 
-def _inertias(chain: Chain, frames: _Frames, qpos: jax.Array) -> _Inertias:
+def _inertias(chain: Chain, frames: _Frames, qpos: Float[Array, 9 * B]) -> _Inertias:
     """Inertias of the nine bodies."""
     mat, origin = jnp.stack([_with_fingers(row) for row in frames.mat]), _with_fingers(frames.pos)
     slid = chain.slide * (qpos - chain.reference)[NUM_JOINTS:]
@@ -367,12 +269,12 @@ def _inertias(chain: Chain, frames: _Frames, qpos: jax.Array) -> _Inertias:
     return _Inertias(chain.mass, first, turned + _point_moments(first, com))
 
 
-def _with_fingers(x: jax.Array) -> jax.Array:
+def _with_fingers(x: Float[Array, "c 7 *B"]) -> Float[Array, "c 9 *B"]:
     """Repeat the last link's entry for both fingers: [k, 7, ...] -> [k, 9, ...]."""
     return jnp.concatenate([x, x[:, -1:], x[:, -1:]], axis=1)
 
 
-def _point_moments(first: jax.Array, com: jax.Array) -> jax.Array:
+def _point_moments(first: Float[Array, 3 * B], com: Float[Array, 3 * B]) -> Float[Array, "3 3 *B"]:
     """Second moments [3, 3, ...] of point masses at ``com`` [3, ...]; ``first`` is mass times ``com``."""
     across = first[:, None] * com[None]
     trace = across[0, 0] + across[1, 1] + across[2, 2]
@@ -380,14 +282,14 @@ def _point_moments(first: jax.Array, com: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-def _momentum(inertias: _Inertias, twist: jax.Array) -> jax.Array:
+def _momentum(inertias: _Inertias, twist: Float[Array, "6 k *B"]) -> Float[Array, "6 k *B"]:
     """Spatial inertias times twists, [6, k, ...]."""
     turn, move = twist[:3], twist[3:]
     moment = _rotate(inertias.second, turn) + cross(inertias.first, move)
     return jnp.concatenate([moment, inertias.mass * move - cross(inertias.first, turn)])
 
 
-def _mass_matrix(chain: Chain, screws: jax.Array, inertias: _Inertias) -> jax.Array:
+def _mass_matrix(chain: Chain, screws: Float[Array, "6 7 *B"], inertias: _Inertias) -> Float[Array, "7 7 *B"]:
     """Joint-space inertia [7, 7, ...] (composite-rigid-body algorithm)."""
     mass, first = _backward_sum(inertias.mass[None])[0], _backward_sum(inertias.first)
     second = jnp.stack([_backward_sum(row) for row in inertias.second])
@@ -399,12 +301,14 @@ def _mass_matrix(chain: Chain, screws: jax.Array, inertias: _Inertias) -> jax.Ar
     return symmetric + jnp.where(row == column, chain.armature, 0)
 
 
-def _backward_sum(x: jax.Array) -> jax.Array:
+def _backward_sum(x: Float[Array, "c 9 *B"]) -> Float[Array, "c 7 *B"]:
     """Along axis 1, the sum of all entries from each on: of nine bodies [k, 9, ...], the links' [k, 7, ...]."""
     return _running_sum(x[:, ::-1])[:, : NUM_FINGERS - 1 : -1]
 
 
-def _twists(chain: Chain, frames: _Frames, screws: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _twists(
+    chain: Chain, frames: _Frames, screws: Float[Array, "6 7 *B"], qvel: Float[Array, 9 * B]
+) -> tuple[Float[Array, "6 9 *B"], Float[Array, "6 9 *B"]]:
     """Twists of the nine bodies, and what each body's own joint adds to them, [6, 9, ...]."""
     slide = _rotate(frames.mat[:, :, -1:], chain.slide) * qvel[NUM_JOINTS:]
     fingers = jnp.concatenate([jnp.zeros_like(slide), slide])
@@ -412,13 +316,15 @@ def _twists(chain: Chain, frames: _Frames, screws: jax.Array, qvel: jax.Array) -
     return _accumulate(added), added
 
 
-def _accumulate(x: jax.Array) -> jax.Array:
+def _accumulate(x: Float[Array, "c 9 *B"]) -> Float[Array, "c 9 *B"]:
     """Along axis 1, the sum of the entries of each body and all that carry it, [k, 9, ...]."""
     links = _running_sum(x[:, :NUM_JOINTS])
     return jnp.concatenate([links, links[:, -1:] + x[:, NUM_JOINTS:]], axis=1)
 
 
-def _forces(chain: Chain, inertias: _Inertias, twist: jax.Array, added: jax.Array) -> jax.Array:
+def _forces(
+    chain: Chain, inertias: _Inertias, twist: Float[Array, "6 9 *B"], added: Float[Array, "6 9 *B"]
+) -> Float[Array, "6 9 *B"]:
     """Forces on the nine bodies while no joint accelerates, [6, 9, ...] (recursive Newton-Euler algorithm)."""
     turn, move = twist[:3], twist[3:]
     # A joint's twist is carried along by its body, so it changes direction.
@@ -431,6 +337,6 @@ def _forces(chain: Chain, inertias: _Inertias, twist: jax.Array, added: jax.Arra
     return _momentum(inertias, lifted) + gyroscopic
 
 
-def _project(screws: jax.Array, force: jax.Array) -> jax.Array:
+def _project(screws: Float[Array, "6 7 *B"], force: Float[Array, "6 9 *B"]) -> Float[Array, 7 * B]:
     """Torques of the hinges, [7, ...]: each carries the forces on everything behind it."""
     return sum_rows(screws * _backward_sum(force))

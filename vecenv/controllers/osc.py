@@ -26,8 +26,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from vecenv.controllers._batch_last import cross, fenced_on_cpu, stage, sum_rows
+from vecenv.util.arrays import AnyArray
 from vecenv.util.rotations import matmul, require_tail, safe_norm
 
 NUM_JOINTS = 7
@@ -72,20 +74,20 @@ class ArmState(NamedTuple):
         bias: gravity and velocity-product torques, [..., 7].
     """
 
-    qpos: jax.Array
-    qvel: jax.Array
-    eef_pos: jax.Array
-    eef_mat: jax.Array
-    jacobian: jax.Array
-    mass_matrix: jax.Array
-    bias: jax.Array
+    qpos: Float[Array, "*B 7"]
+    qvel: Float[Array, "*B 7"]
+    eef_pos: Float[Array, "*B 3"]
+    eef_mat: Float[Array, "*B 3 3"]
+    jacobian: Float[Array, "*B 6 7"]
+    mass_matrix: Float[Array, "*B 7 7"]
+    bias: Float[Array, "*B 7"]
 
 
 class OscGoal(NamedTuple):
     """Pose the controller pulls the grip site to: ``pos`` [..., 3] and ``mat`` [..., 3, 3], world frame."""
 
-    pos: jax.Array
-    mat: jax.Array
+    pos: Float[Array, "*B 3"]
+    mat: Float[Array, "*B 3 3"]
 
 
 _TAILS: tuple[tuple[int, ...], ...] = ((7,), (7,), (3,), (3, 3), (6, 7), (7, 7), (7,))
@@ -111,7 +113,9 @@ def hold_goal(arm: ArmState) -> OscGoal:
 
 
 @partial(jax.jit, static_argnames="config")
-def set_goal(arm: ArmState, goal: OscGoal, delta_action: jax.Array, config: OscConfig = OSC_POSE) -> OscGoal:
+def set_goal(
+    arm: ArmState, goal: OscGoal, delta_action: Float[AnyArray, "*B 6"], config: OscConfig = OSC_POSE
+) -> OscGoal:
     """Set the goal from a policy action, as ``OperationalSpaceController.set_goal`` does once per control tick.
 
     The goal is relative to where the arm *is*, not to the previous goal. The orientation goal is kept when all three
@@ -139,7 +143,7 @@ def set_goal(arm: ArmState, goal: OscGoal, delta_action: jax.Array, config: OscC
     return OscGoal(arm.eef_pos + action[..., :3] * config.max_delta_pos, jnp.where(keep, goal.mat, turned))
 
 
-def _robosuite_rotation(rotvec: jax.Array) -> jax.Array:
+def _robosuite_rotation(rotvec: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
     """Rotation matrix of a rotation vector with robosuite's rounding (``quat2mat(axisangle2quat(v))``).
 
     ``quat2mat`` works in float32 whatever it is given, which moves a goal by up to 1e-7 rad. The same roundings are
@@ -177,7 +181,9 @@ def _round_to_float32_jvp(primals: Any, tangents: Any) -> tuple[jax.Array, jax.A
 
 
 @partial(jax.jit, static_argnames="config")
-def torques(arm: ArmState, goal: OscGoal, home_qpos: jax.Array, config: OscConfig = OSC_POSE) -> jax.Array:
+def torques(
+    arm: ArmState, goal: OscGoal, home_qpos: Float[AnyArray, "*B 7"], config: OscConfig = OSC_POSE
+) -> Float[Array, "... 7"]:
     """Joint torques that pull the grip site to the goal: ``OperationalSpaceController.run_controller``, then clipped.
 
     Args:
@@ -211,7 +217,9 @@ def _to_batch_last(x: jax.Array, batch: tuple[int, ...], tail: tuple[int, ...]) 
 # Arrays are [rows, columns, slots] from here on, and the work is cut into stages: see ``_batch_last``.
 
 
-def _torques_last(arm: ArmState, goal: OscGoal, home: jax.Array, *, config: OscConfig, fence: bool) -> jax.Array:
+def _torques_last(
+    arm: ArmState, goal: OscGoal, home: Float[Array, "7 N"], *, config: OscConfig, fence: bool
+) -> Float[Array, "7 N"]:
     """``torques`` on batch-last arrays: [7, N]."""
     force, moment, acceleration = stage(fence, partial(_desired, config=config), arm, goal, home)
     tables = [stage(fence, _table, arm.mass_matrix, arm.jacobian, acceleration)]
@@ -240,19 +248,21 @@ def _desired(arm: ArmState, goal: OscGoal, home: jax.Array, *, config: OscConfig
     return force, moment, config.nullspace_kp * (home - arm.qpos) - joint_kd * arm.qvel
 
 
-def _table(mass_matrix: jax.Array, jacobian: jax.Array, acceleration: jax.Array) -> jax.Array:
+def _table(
+    mass_matrix: Float[Array, "7 7 N"], jacobian: Float[Array, "6 7 N"], acceleration: Float[Array, "7 N"]
+) -> Float[Array, "7 14 N"]:
     """[M | Jᵀ | M a], [7, 14, N]: eliminating M's lower triangle leaves the rows of D Lᵀ, D X and D Lᵀ a."""
     inertial = sum_rows(mass_matrix * acceleration[:, None])
     return jnp.concatenate([mass_matrix, jnp.moveaxis(jacobian, 0, 1), inertial[:, None]], axis=1)
 
 
-def _eliminate_row(rest: jax.Array) -> jax.Array:
+def _eliminate_row(rest: Float[Array, "k m N"]) -> Float[Array, "k-1 m-1 N"]:
     """One step of Gaussian elimination without pivoting (M is positive definite): [k, m, N] -> [k - 1, m - 1, N]."""
     pivot = rest[0, 1:]
     return rest[1:, 1:] - (pivot[: rest.shape[0] - 1] / rest[0, 0])[:, None] * pivot
 
 
-def _scale_rows(tables: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+def _scale_rows(tables: list[jax.Array]) -> tuple[Float[Array, "7 7 N"], Float[Array, "7 7 N"]]:
     """Lᵀ [7, 7, N], zero below the diagonal, and [X | Lᵀ a] [7, 7, N], from the first rows of the tables."""
     rows = [table[0] for table in tables]
     scale = lax.rsqrt(jnp.stack([row[0] for row in rows]))[:, None]
@@ -261,7 +271,9 @@ def _scale_rows(tables: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
     return jnp.stack(factor) * scale, jnp.stack(whitened) * scale
 
 
-def _systems(whitened: jax.Array, force: jax.Array, moment: jax.Array) -> tuple[jax.Array, ...]:
+def _systems(
+    whitened: Float[Array, "7 7 N"], force: Float[Array, "3 N"], moment: Float[Array, "3 N"]
+) -> tuple[Float[Array, "8 7 N"], Float[Array, "8 3 N"], Float[Array, "6 N"], Float[Array, "3 N"]]:
     """What Gram-Schmidt works on: columns [8, k, N] whose eighth entry is the column's right-hand side.
 
     Returns:
@@ -279,11 +291,13 @@ def _systems(whitened: jax.Array, force: jax.Array, moment: jax.Array) -> tuple[
 class _Direction(NamedTuple):
     """One orthogonal direction: the first column of ``block`` [8, k, N], and its ``inverse`` squared length [N]."""
 
-    block: jax.Array
-    inverse: jax.Array
+    block: Float[Array, "8 k N"]
+    inverse: Float[Array, " N"]
 
 
-def _orthogonalise(block: jax.Array, floor: jax.Array, count: int, fence: bool) -> tuple[list[_Direction], jax.Array]:
+def _orthogonalise(
+    block: Float[Array, "8 k N"], floor: Float[Array, "count N"], count: int, fence: bool
+) -> tuple[list[_Direction], Float[Array, "8 rest N"]]:
     """Modified Gram-Schmidt over the first ``count`` columns of a system [8, k, N].
 
     Returns:
@@ -297,7 +311,9 @@ def _orthogonalise(block: jax.Array, floor: jax.Array, count: int, fence: bool) 
     return basis, block
 
 
-def _project(block: jax.Array, floor: jax.Array, *, index: int) -> tuple[jax.Array, jax.Array]:
+def _project(
+    block: Float[Array, "8 k N"], floor: Float[Array, "count N"], *, index: int
+) -> tuple[Float[Array, " N"], Float[Array, "k-1 N"]]:
     """Inverse squared length of the first column [N] and the other columns' components along it [k - 1, N]."""
     pivot = block[:7, 0]
     squared = sum_rows(pivot * pivot)
@@ -306,17 +322,19 @@ def _project(block: jax.Array, floor: jax.Array, *, index: int) -> tuple[jax.Arr
     return inverse, sum_rows(pivot[:, None] * block[:7, 1:]) * inverse
 
 
-def _remove(block: jax.Array, ratio: jax.Array) -> jax.Array:
+def _remove(block: Float[Array, "8 k N"], ratio: Float[Array, "k-1 N"]) -> Float[Array, "8 k-1 N"]:
     """The other columns less their component along the first, [8, k - 1, N]."""
     return block[:, 1:] - block[:, :1] * ratio
 
 
-def _components(basis: list[_Direction], rest: jax.Array) -> list[jax.Array]:
+def _components(basis: list[_Direction], rest: Float[Array, "8 1 N"]) -> list[Float[Array, " N"]]:
     """Components [N] of the last column [8, 1, N] along each direction."""
     return [sum_rows(along.block[:7, 0] * rest[:7, 0]) * along.inverse for along in basis]
 
 
-def _remove_all(basis: list[_Direction], components: list[jax.Array], rest: jax.Array) -> jax.Array:
+def _remove_all(
+    basis: list[_Direction], components: list[Float[Array, " N"]], rest: Float[Array, "8 1 N"]
+) -> Float[Array, "7 N"]:
     """The last column less these components, [7, N]."""
     vector = rest[:7, 0]
     for along, component in zip(basis, components, strict=True):
@@ -344,14 +362,18 @@ def _solutions(*bases: list[_Direction]) -> list[list[jax.Array]]:
     return found
 
 
-def _add_solutions(basis: list[_Direction], components: list[jax.Array], free: jax.Array) -> jax.Array:
+def _add_solutions(
+    basis: list[_Direction], components: list[Float[Array, " N"]], free: Float[Array, "7 N"]
+) -> Float[Array, "7 N"]:
     """Whitened torque [7, N]: the shortest solutions of both systems plus the posture's free part."""
     for along, component in zip(basis, components, strict=True):
         free = free + along.block[:7, 0] * component
     return free
 
 
-def _finish(factor: jax.Array, whitened: jax.Array, bias: jax.Array, *, config: OscConfig) -> jax.Array:
+def _finish(
+    factor: Float[Array, "7 7 N"], whitened: Float[Array, "7 N"], bias: Float[Array, "7 N"], *, config: OscConfig
+) -> Float[Array, "7 N"]:
     """Torques ``L whitened + bias``, clipped, [7, N]."""
     raw = sum_rows(factor * whitened[:, None]) + bias
     limit = jnp.asarray(config.torque_limit, raw.dtype)[:, None]

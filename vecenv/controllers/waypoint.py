@@ -20,12 +20,14 @@ give the simple form.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from vecenv.controllers.osc import OSC_POSE, OscConfig
+from vecenv.util.arrays import AnyArray
 from vecenv.util.rotations import quat_mul, quat_normalize, require_tail, rotation_between, rotvec_to_quat, safe_norm
 
 
@@ -58,8 +60,8 @@ STEP_EE_POSE = WaypointConfig()
 class Pose(NamedTuple):
     """Position ``pos`` [..., 3] in metres and unit quaternion ``quat`` [..., 4] wxyz, world frame."""
 
-    pos: Any
-    quat: Any
+    pos: Float[AnyArray, "*B 3"]
+    quat: Float[AnyArray, "*B 4"]
 
 
 class Target(NamedTuple):
@@ -72,11 +74,11 @@ class Target(NamedTuple):
     """
 
     pose: Pose
-    grip: jax.Array
-    valid: jax.Array
+    grip: Float[Array, "*B"]
+    valid: Bool[Array, "*B"]
 
 
-def read_target(waypoint: jax.Array) -> Target:
+def read_target(waypoint: Float[AnyArray, "*B 8"]) -> Target:
     """Split and check waypoints.
 
     Args:
@@ -97,13 +99,13 @@ def read_target(waypoint: jax.Array) -> Target:
     return Target(Pose(pos, quat), jnp.where(valid, waypoint[..., 7], 0), valid)
 
 
-def gripper_action(grip: jax.Array) -> jax.Array:
+def gripper_action(grip: Real[AnyArray, "*B"]) -> Real[Array, "*B"]:
     """Gripper action [...] of a grip bit [...]: +1 (close) above one half, else -1 (open)."""
     grip = jnp.asarray(grip)
     return jnp.where(grip > 0.5, jnp.ones_like(grip), -jnp.ones_like(grip))
 
 
-def hold_action(grip: jax.Array) -> jax.Array:
+def hold_action(grip: Real[AnyArray, "*B"]) -> Real[Array, "*B 7"]:
     """Action of a hold tick, [..., 7]: no motion, the gripper command of the grip bit [...].
 
     The OSC then keeps the position it has and its last commanded orientation.
@@ -115,11 +117,11 @@ def hold_action(grip: jax.Array) -> jax.Array:
 def servo(
     current: Pose,
     target: Pose,
-    grip: jax.Array,
+    grip: Real[AnyArray, "*B"],
     reference: Pose,
     config: WaypointConfig = STEP_EE_POSE,
     osc: OscConfig = OSC_POSE,
-) -> tuple[jax.Array, Pose]:
+) -> tuple[Float[Array, "... 7"], Pose]:
     """Action of one tick towards the targets.
 
     Args:
@@ -157,23 +159,23 @@ def _advance(reference: Pose, target: Pose, config: WaypointConfig) -> Pose:
     return Pose(reference.pos + step, _turn(reference.quat, turn))
 
 
-def _bounded(vector: jax.Array, length: float) -> jax.Array:
+def _bounded(vector: Float[Array, "*B 3"], length: float) -> Float[Array, "*B 3"]:
     """Vectors [..., 3] shortened to at most ``length``."""
     norm = safe_norm(vector)[..., None]
     return vector * jnp.where(norm > length, length / jnp.where(norm > length, norm, 1), 1)
 
 
-def _turn(quat: jax.Array, rotvec: jax.Array) -> jax.Array:
+def _turn(quat: Float[AnyArray, "*#B 4"], rotvec: Float[Array, "*#B 3"]) -> Float[Array, "*#B 4"]:
     """Unit quaternions [..., 4] turned by world-frame rotation vectors [..., 3]."""
     return quat_normalize(quat_mul(rotvec_to_quat(rotvec), quat))[0]
 
 
-def pose_error(current: Pose, target: Pose) -> tuple[jax.Array, jax.Array]:
+def pose_error(current: Pose, target: Pose) -> tuple[Float[Array, ...], Float[Array, ...]]:
     """Distance [...] in metres and angle [...] in radians (at most pi) between poses."""
     return safe_norm(target.pos - current.pos), safe_norm(rotation_between(current.quat, target.quat))
 
 
-def converged(current: Pose, target: Pose, config: WaypointConfig = STEP_EE_POSE) -> jax.Array:
+def converged(current: Pose, target: Pose, config: WaypointConfig = STEP_EE_POSE) -> Bool[Array, ...]:
     """Bool [...]: position and rotation are both within tolerance.
 
     To be asked after a tick: a call then uses at least one, and its gripper command is always given.
@@ -182,7 +184,7 @@ def converged(current: Pose, target: Pose, config: WaypointConfig = STEP_EE_POSE
     return (distance <= config.pos_tol) & (angle <= config.rot_tol)
 
 
-class Plan(NamedTuple):
+class WaypointPlan(NamedTuple):
     """Waypoints of B slots, T each, to be followed in order.
 
     Attributes:
@@ -193,9 +195,9 @@ class Plan(NamedTuple):
     """
 
     pose: Pose
-    grip: Any
-    hold: Any
-    valid: Any
+    grip: Real[AnyArray, "B T"]
+    hold: Int[AnyArray, "B T"]
+    valid: Bool[AnyArray, "B T"]
 
 
 class Progress(NamedTuple):
@@ -210,15 +212,15 @@ class Progress(NamedTuple):
         ticks: ticks spent on each, int [B, T].
     """
 
-    index: jax.Array
-    spent: jax.Array
-    misses: jax.Array
+    index: Int[Array, " B"]
+    spent: Int[Array, " B"]
+    misses: Int[Array, " B"]
     reference: Pose
-    converged: jax.Array
-    ticks: jax.Array
+    converged: Bool[Array, "B T"]
+    ticks: Int[Array, "B T"]
 
 
-def begin_plan(plan: Plan, current: Pose) -> Progress:
+def begin_plan(plan: WaypointPlan, current: Pose) -> Progress:
     """Progress before the first tick, from the end effector's pose now."""
     shape = plan.valid.shape
     none = jnp.zeros(shape[0], jnp.int32)
@@ -226,14 +228,14 @@ def begin_plan(plan: Plan, current: Pose) -> Progress:
     return Progress(index, none, none, current, jnp.zeros(shape, bool), jnp.zeros(shape, jnp.int32))
 
 
-def unfinished(plan: Plan, progress: Progress) -> jax.Array:
+def unfinished(plan: WaypointPlan, progress: Progress) -> Bool[Array, " B"]:
     """Bool [B]: a waypoint is left."""
     return progress.index < plan.valid.shape[1]
 
 
 def plan_action(
-    plan: Plan, progress: Progress, current: Pose, config: WaypointConfig = STEP_EE_POSE
-) -> tuple[jax.Array, Progress]:
+    plan: WaypointPlan, progress: Progress, current: Pose, config: WaypointConfig = STEP_EE_POSE
+) -> tuple[Float[Array, "B 7"], Progress]:
     """Action of one tick, [B, 7], and the progress with the servo's new reference."""
     target, grip, hold = _at_index(plan, progress.index)
     moving, ahead = servo(current, target, grip, progress.reference, config)
@@ -244,7 +246,11 @@ def plan_action(
 
 
 def plan_advance(
-    plan: Plan, progress: Progress, current: Pose, moved: jax.Array, config: WaypointConfig = STEP_EE_POSE
+    plan: WaypointPlan,
+    progress: Progress,
+    current: Pose,
+    moved: Bool[AnyArray, " B"],
+    config: WaypointConfig = STEP_EE_POSE,
 ) -> Progress:
     """Progress after a tick.
 
@@ -274,13 +280,13 @@ def plan_advance(
     return jax.tree.map(lambda new, old: jnp.where(moved.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, progress)
 
 
-def _at_index(plan: Plan, index: jax.Array) -> tuple[Pose, jax.Array, jax.Array]:
+def _at_index(plan: WaypointPlan, index: Int[Array, " B"]) -> tuple[Pose, Real[AnyArray, " B"], Int[AnyArray, " B"]]:
     """Pose, grip and hold of one waypoint a slot; past the end, of the last."""
     slot, at = jnp.arange(index.shape[0]), jnp.minimum(index, plan.valid.shape[1] - 1)
     return Pose(plan.pose.pos[slot, at], plan.pose.quat[slot, at]), plan.grip[slot, at], plan.hold[slot, at]
 
 
-def _next_valid(valid: jax.Array, index: jax.Array) -> jax.Array:
+def _next_valid(valid: Bool[AnyArray, "B T"], index: Int[Array, " B"]) -> Int[Array, " B"]:
     """The first valid waypoint at or after ``index``, or T."""
     count = valid.shape[1]
     ahead = valid & (jnp.arange(count) >= index[:, None])

@@ -91,7 +91,7 @@ def default_config() -> config_dict.ConfigDict:
     )
 
 
-class PlaygroundEnv(functional.LiberoEnv, MjxEnv):
+class PlaygroundEnv(functional.FunctionalLibero, MjxEnv):
     """A LIBERO task as Playground's ``MjxEnv``.
 
     Args:
@@ -100,7 +100,7 @@ class PlaygroundEnv(functional.LiberoEnv, MjxEnv):
         config_overrides: options that replace those of ``config``.
 
     Raises:
-        FunctionalError: an option that cannot be honoured; and what ``functional.LiberoEnv`` raises.
+        FunctionalError: an option that cannot be honoured; and what ``functional.FunctionalLibero`` raises.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class PlaygroundEnv(functional.LiberoEnv, MjxEnv):
         self._config.update_from_flattened_dict(dict(config_overrides or {}))
         if (self._config.ctrl_dt, self._config.sim_dt) != (_CTRL_DT, _SIM_DT):
             raise FunctionalError(f"a LIBERO step is {_CTRL_DT} s in substeps of {_SIM_DT} s; that cannot be changed")
-        functional.LiberoEnv.__init__(self, suite, task=task, config=_functional(self._config))
+        functional.FunctionalLibero.__init__(self, suite, task=task, config=_functional(self._config))
 
     def render(self, trajectory: Any, *args: Any, **options: Any) -> Any:
         """Images of the collision geometry, which is all that the physics model has.

@@ -25,7 +25,7 @@ def compile_command(
     from rich.progress import track
 
     import vecenv
-    from vecenv.libero.scene.bddl import BDDLError
+    from vecenv.libero.scene.bddl_syntax import BDDLError
     from vecenv.libero.scene.contacts import CONTACTS
     from vecenv.libero.scene.lean.geometry import PROFILES
     from vecenv.libero.scene.scene import SceneError

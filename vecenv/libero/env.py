@@ -7,7 +7,6 @@ their start states, goals and instructions, which are data. Read ``vecenv/contra
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,54 +17,23 @@ import numpy as np
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv import protocols
-from vecenv.contract import (
-    Control,
-    Egocentric,
-    Objects,
-    ObjectsSnapshot,
-    Part,
-    PartJoint,
-    PointCloud,
-    RegionBox,
-    State,
-)
+from vecenv.contract import Control, Egocentric, Objects, State
 from vecenv.controllers import waypoint
+from vecenv.libero import observe, starts
 from vecenv.libero.config import LiberoConfig, LiberoError
-from vecenv.libero.physics import budgets, settling
 from vecenv.libero.physics.base import SETTLE_ACTION, Group, Physics, Start
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.build import make_physics
 from vecenv.libero.render.cameras import CameraRig, options_of
 from vecenv.libero.render.options import VisualOptions
-from vecenv.libero.scene import goals, surface
+from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import Problem, SceneKey
-from vecenv.libero.scene.parts import PartSpec, opening, scene_parts
 from vecenv.libero.scene.scene import Scene
 from vecenv.libero.tasks import fixtures as fixture_poses
-from vecenv.libero.tasks import settled as settled_starts
 from vecenv.libero.tasks.export import exported_tasks
 from vecenv.libero.tasks.sources import Task, installed_tasks
 from vecenv.libero.tasks.suites import NUM_EPISODES
 from vecenv.slots import SlotBatch
-
-# Starts of a scene on which its memory on MJX is measured.
-_BUDGET_STARTS = 64
-
-
-def _joined(starts: Sequence[Start]) -> Start:
-    """Settled starts of one scene, one after the other."""
-
-    def join(name: str) -> np.ndarray:
-        return np.concatenate([getattr(start, name) for start in starts])
-
-    return Start(
-        qpos=join("qpos"),
-        qvel=join("qvel"),
-        bodies=starts[0].bodies,
-        body_pos=join("body_pos"),
-        body_quat=join("body_quat"),
-        settled=True,
-    )
 
 
 @dataclass(frozen=True)
@@ -173,29 +141,7 @@ class LiberoEnv(SlotBatch):
         """Memory on MJX: as configured, or measured on the starts of all the suite's tasks in the scene."""
         if self.config.backend == "native" or self.config.budget is not None:
             return self.config.budget
-        sharing = [i for i, task in enumerate(self._sources) if task.problem().scene_key() == scene_key]
-        each = -(-_BUDGET_STARTS // len(sharing))
-        episodes = np.linspace(0, NUM_EPISODES - 1, min(each, NUM_EPISODES)).astype(int)
-        return budgets.cached(scene, _joined([self._central_start(scene, i, episodes) for i in sharing]))
-
-    def _central_start(self, scene: Scene, task: int, episodes: np.ndarray) -> Start:
-        """Settled starts of a task, fixtures at the centre."""
-        source, starts = self._sources[task], self._sources[task].settled()
-        bodies, pos, quat = fixture_poses.poses(
-            source.problem(),
-            scene,
-            "center",
-            keys=[(self._rules.seed, self.suite, task, int(episode)) for episode in episodes],
-            slots=list(range(len(episodes))),
-        )
-        return Start(
-            qpos=starts.qpos[episodes],
-            qvel=starts.qvel[episodes],
-            bodies=bodies,
-            body_pos=pos,
-            body_quat=quat,
-            settled=True,
-        )
+        return starts.measured_budget(scene, starts.sharing(self._sources, scene_key))
 
     def _goal_table(self, group: Group) -> goals.GoalTable:
         tasks = self._placement.task[group.slots]
@@ -220,52 +166,12 @@ class LiberoEnv(SlotBatch):
             self.physics.control_step(settle, stale)
 
     def _start(self, scene: Scene, task: int, slots: np.ndarray) -> Start:
-        data = self._tasks[task]
-        episodes = self._placement.episode[slots]
-        qpos, qvel = self._stored(data)
-        nq, nv = scene.model.nq, scene.model.nv
-        if (qpos.shape[1], qvel.shape[1]) != (nq, nv):
-            raise LiberoError(
-                f"{self.suite} task {task} ({data.source.name}): starts of {qpos.shape[1]} + {qvel.shape[1]} numbers, "
-                f"but the scene has {nq} positions and {nv} velocities"
-            )
-        bodies, pos, quat = fixture_poses.poses(
-            data.problem,
-            scene,
-            self._rules.fixtures,
-            keys=[(self._rules.seed, self.suite, task, int(episode)) for episode in episodes],
-            slots=slots.tolist(),
-            loop=self._rules.reset_loop,
-        )
-        settled = self._rules.start == "settled" and self._rules.fixtures == "center"
-        start = Start(
-            qpos=qpos[episodes],
-            qvel=qvel[episodes],
-            bodies=bodies,
-            body_pos=pos,
-            body_quat=quat,
-            time=settled_starts.TIME if settled else 0.0,
-            settled=settled,
-        )
-        if settled or self._rules.start == "raw":
-            return start
-        return settling.at_rest(self._settling_scene(data, scene), start)
-
-    def _settling_scene(self, data: _TaskData, scene: Scene) -> Scene:
-        """The scene that starts settle in: upstream's geometry, published contacts."""
-        if self.config.geometry == "exact" and self.config.contacts == "published":
-            return scene
-        return data.source.scene(goals.contact_pairs([data.problem]))
-
-    def _stored(self, data: _TaskData) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [50, nq] and velocities [50, nv] of a task's starts."""
-        if self._rules.start == "settled" and self._rules.fixtures == "center":
-            starts = data.source.settled()
-            return starts.qpos, starts.qvel
-        states, free_joints = data.source.init_states(), len(data.problem.objects)
-        # Robot, hinges and slides have as many positions as velocities; a free joint has one position more.
-        nq = (states.shape[1] - 1 + free_joints) // 2
-        return states[:, 1 : 1 + nq], states[:, 1 + nq :]
+        data, episodes = self._tasks[task], self._placement.episode[slots]
+        keys = [(self._rules.seed, self.suite, task, int(episode)) for episode in episodes]
+        try:
+            return starts.start_of(data.source, scene, self.config, self._rules, episodes, slots, keys)
+        except starts.StoredStartsError as error:
+            raise LiberoError(f"{self.suite} task {task} ({data.source.name}): {error}") from error
 
     def close(self) -> None:
         """Release physics and renderer; the environment cannot be used afterwards. Closing twice is harmless."""
@@ -305,11 +211,13 @@ class LiberoEnv(SlotBatch):
 
     def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         poses = waypoint.Pose(targets[:, None, :3], targets[:, None, 3:7])
-        plan = waypoint.Plan(poses, targets[:, 7:], hold[:, None], moves[:, None])
+        plan = waypoint.WaypointPlan(poses, targets[:, 7:], hold[:, None], moves[:, None])
         reward, arrived, _ = self._follow(plan)
         return reward, arrived[:, 0]
 
-    def _follow(self, plan: waypoint.Plan, max_misses: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _follow(
+        self, plan: waypoint.WaypointPlan, max_misses: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         followed = self.physics.follow(
             plan,
             ~self.done,
@@ -334,12 +242,11 @@ class LiberoEnv(SlotBatch):
         and textures are missing.
         """
         self._check_live()
-        physics = self.physics
-        state = np.concatenate([physics.eef_pos, axis_angle(physics.eef_quat), physics.fingers], axis=1)
-        problems = [self._tasks[int(self._placement.task[group.slots[0]])].problem for group in physics.groups]
-        seen = self._cameras.capture(physics.groups, problems)
+        groups = self.physics.groups
+        problems = [self._tasks[int(self._placement.task[group.slots[0]])].problem for group in groups]
+        seen = self._cameras.capture(groups, problems)
         return Egocentric(
-            state=state.astype(np.float32),
+            state=observe.proprioception(self.physics),
             images=seen.images,
             depths=seen.depths,
             segmentations=seen.segmentations,
@@ -373,50 +280,8 @@ class LiberoEnv(SlotBatch):
             ExportError: lean scenes come from a folder that has no exact ones.
         """
         self._check_live()
-        if points not in ("surface", "aabb"):
-            raise LiberoError(f"points={points!r}: expected 'surface' or 'aabb'")
-        snapshots: list[ObjectsSnapshot | None] = [None] * self.num_envs
-        errors = list(self._fault)
-        for group in self.physics.groups:
-            group.refresh_kinematics()
-            samples = _Clouds.of(group.scene, self._exact_scene(group))
-            clouds, parts = samples.world(group, points), samples.parts_in_world(group)
-            for row, slot in enumerate(group.slots):
-                if not errors[slot]:
-                    snapshots[slot] = self._snapshot(group, row, int(slot), clouds, parts[row])
-        return Objects(
-            snapshot=tuple(snapshots), error=tuple(f"physics failed: {reason}" if reason else "" for reason in errors)
-        )
-
-    def _snapshot(
-        self,
-        group: Group,
-        row: int,
-        slot: int,
-        clouds: Mapping[str, tuple[np.ndarray, np.ndarray]],
-        parts: Mapping[str, Part],
-    ) -> ObjectsSnapshot:
-        scene, problem = group.scene, self._tasks[int(self._placement.task[slot])].problem
-        named = {name: PointCloud(pos[row], normal[row]) for name, (pos, normal) in clouds.items()}
-        scenery = named.pop(_SCENERY)
-        everything = [*named.values(), scenery]
-        return ObjectsSnapshot(
-            names=tuple(scene.entities),
-            objects=named,
-            poses={name: _body_pose(group, row, entity.root_body) for name, entity in scene.entities.items()},
-            regions={name: _region_box(group, row, name) for name in scene.regions},
-            goal=tuple((predicate.name, *predicate.args) for predicate in problem.goal),
-            scene=PointCloud(
-                np.concatenate([cloud.points for cloud in everything]),
-                np.concatenate([cloud.normals for cloud in everything]),
-            ),
-            ee_pose=np.concatenate([group.site_xpos[row, scene.grip_site], group.xquat[row, scene.hand_body]]),
-            gripper=group.qpos[row, scene.finger_qpos].copy(),
-            workspace=scene.workspace_bounds,
-            targets=problem.obj_of_interest,
-            movable=tuple(entity.name for entity in scene.objects),
-            parts=parts,
-        )
+        problems = [self._tasks[int(task)].problem for task in self._placement.task]
+        return observe.objects(self.physics.groups, self._exact_scene, problems, self._fault, points)
 
     def check_success(self) -> np.ndarray:
         """Whether each slot's goal holds in its present state, bool [B]; unlike ``evaluate`` not tied to a tick."""
@@ -508,119 +373,6 @@ class LiberoEnv(SlotBatch):
             qpos, qvel = chosen.qpos[slots, : model.nq], chosen.qvel[slots, : model.nv]
             self.physics.write_state(group, qpos, qvel, chosen.time[slots])
         self._quarantine(np.ones(self.num_envs, bool))
-
-
-_SCENERY = ""
-
-
-@dataclass(frozen=True)
-class _Clouds:
-    """Body-frame samples of everything in a scene."""
-
-    surface: Mapping[str, surface.BodyPoints]
-    corners: Mapping[str, surface.BodyPoints]
-    parts: Mapping[str, PartSpec]
-
-    @staticmethod
-    @functools.lru_cache(maxsize=64)
-    def _cached(scene_id: int, scene: _ByIdentity, exact: _ByIdentity) -> _Clouds:
-        names = tuple(scene.value.entities)
-        points = {name: surface.entity_points(scene.value, name) for name in names}
-        points[_SCENERY] = surface.scenery_points(scene.value)
-        corners = {name: surface.entity_corners(scene.value, name) for name in names}
-        return _Clouds(points, corners, scene_parts(exact.value))
-
-    @staticmethod
-    def of(scene: Scene, exact: Scene) -> _Clouds:
-        """Samples of a scene's geoms, and parts measured on the same scene with upstream's."""
-        return _Clouds._cached(id(scene), _ByIdentity(scene), _ByIdentity(exact))
-
-    def world(self, group: Group, points: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        clouds = {name: cloud.world(group.xpos, group.xmat) for name, cloud in self.surface.items()}
-        if points == "aabb":
-            for name, corners in self.corners.items():
-                pos, _ = corners.world(group.xpos, group.xmat)
-                clouds[name] = surface.box_samples(pos.min(axis=1), pos.max(axis=1))
-        return clouds
-
-    def parts_in_world(self, group: Group) -> list[dict[str, Part]]:
-        """The parts of each slot of a group."""
-        clouds = {name: spec.points.world(group.xpos, group.xmat) for name, spec in self.parts.items()}
-        return [
-            {name: _part(group, row, self.parts[name], pos[row], normal[row]) for name, (pos, normal) in clouds.items()}
-            for row in range(len(group.slots))
-        ]
-
-
-class _ByIdentity:
-    """Makes an unhashable scene a cache key: equal only to itself, and kept alive by the cache."""
-
-    def __init__(self, value: Scene) -> None:
-        self.value = value
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByIdentity) and other.value is self.value
-
-
-def _body_pose(group: Group, row: int, body: str) -> np.ndarray:
-    index = group.scene.model.body(body).id
-    return np.concatenate([group.xpos[row, index], group.xquat[row, index]])
-
-
-def _region_box(group: Group, row: int, name: str) -> RegionBox:
-    model, region = group.scene.model, group.scene.regions[name]
-    site = model.site(name).id
-    axis = None
-    for joint in region.joints:
-        if model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_SLIDE:
-            axis = group.xmat[row, model.joint(joint).bodyid[0]].reshape(3, 3) @ model.joint(joint).axis
-    return RegionBox(
-        pos=group.site_xpos[row, site].copy(),
-        mat=group.site_xmat[row, site].reshape(3, 3).copy(),
-        half_extents=np.array(region.size),
-        parent=region.parent,
-        axis=axis,
-    )
-
-
-def _part(group: Group, row: int, spec: PartSpec, pos: np.ndarray, normal: np.ndarray) -> Part:
-    return Part(
-        parent=spec.parent,
-        kind=spec.kind,
-        cloud=PointCloud(pos, normal),
-        box=_region_box(group, row, spec.region) if spec.region else None,
-        joint=_part_joint(group, row, spec.joint) if spec.joint else None,
-    )
-
-
-def _part_joint(group: Group, row: int, name: str) -> PartJoint:
-    model = group.scene.model
-    joint = model.joint(name)
-    end = opening(model, name)
-    body = int(joint.bodyid[0])
-    mat = group.xmat[row, body].reshape(3, 3)
-    return PartJoint(
-        kind="slide" if joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE else "hinge",
-        axis=mat @ joint.axis * np.sign(end),
-        anchor=group.xpos[row, body] + mat @ joint.pos,
-        travel=abs(end),
-        opened=float(group.qpos[row, joint.qposadr[0]] * np.sign(end)),
-    )
-
-
-def axis_angle(quat: np.ndarray) -> np.ndarray:
-    """Rotation vectors [..., 3] of quaternions wxyz [..., 4], with the angle in [0, 2 pi), as LIBERO policies expect.
-
-    The convention is that of robosuite's ``quat2axisangle``: no sign is chosen, and a rotation of zero is zero.
-    """
-    w = np.clip(quat[..., :1], -1.0, 1.0)
-    norm = np.sqrt(1.0 - w * w)
-    small = np.isclose(norm, 0.0, rtol=1e-9, atol=0.0)
-    scale = np.where(small, 0.0, 2.0 * np.arccos(w) / np.where(small, 1.0, norm))
-    return quat[..., 1:] * scale
 
 
 def make(suite: str, *, tasks: object = None, episodes: object = None, config: LiberoConfig | None = None) -> LiberoEnv:

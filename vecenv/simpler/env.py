@@ -21,7 +21,7 @@ import numpy as np
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv.contract import CameraView, Control, Egocentric, Objects, Rendered, State
-from vecenv.controllers.waypoint import Plan
+from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.config import SimplerConfig, SimplerError
 from vecenv.simpler.control import kinematics, robots
@@ -235,7 +235,7 @@ class SimplerEnv(SlotBatch):
             going = going & ~self.done & (used < ticks) & ~(driving & arrived) & ~stuck
         return reward, arrived
 
-    def _follow(self, plan: Plan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _follow(self, plan: WaypointPlan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         followed = _Followed(self, plan, max_misses)
         return followed.run(), followed.converged, followed.ticks
 

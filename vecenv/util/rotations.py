@@ -101,6 +101,15 @@ def quat_conjugate(quat: ArrayLike) -> jax.Array:
     return jnp.concatenate([quat[..., :1], -quat[..., 1:]], axis=-1)
 
 
+def rotate(quat: ArrayLike, v: ArrayLike) -> jax.Array:
+    """Vectors [..., 3] turned by unit wxyz quaternions [..., 4]."""
+    quat, v = jnp.asarray(quat), jnp.asarray(v)
+    require_tail("quat", quat, (4,))
+    require_tail("v", v, (3,))
+    twice = 2 * jnp.cross(quat[..., 1:], v)
+    return v + quat[..., :1] * twice + jnp.cross(quat[..., 1:], twice)
+
+
 def quat_to_mat(quat: ArrayLike) -> jax.Array:
     """Rotation matrices [..., 3, 3] of unit wxyz quaternions [..., 4]."""
     quat = jnp.asarray(quat)

@@ -14,8 +14,15 @@ from support.upstream import scene_ids, scene_tasks
 
 import vecenv
 from vecenv.libero import functional
-from vecenv.libero.env import LiberoEnv as BatchedEnv
-from vecenv.libero.functional.env import FunctionalConfig, FunctionalError, LiberoEnv, Randomization, State, randomize
+from vecenv.libero.env import LiberoEnv
+from vecenv.libero.functional import (
+    FunctionalConfig,
+    FunctionalError,
+    FunctionalLibero,
+    FunctionalState,
+    Randomization,
+    randomize,
+)
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.mjx import backend as mjx
 from vecenv.libero.tasks.suites import UnknownTask
@@ -34,15 +41,15 @@ compiled: Callable[..., Callable[..., Any]] = partial(jax.jit, compiler_options=
 
 
 @cache
-def made(suite: str = "libero_object", task: int = 0, **options: Any) -> LiberoEnv:
-    return LiberoEnv(suite, task=task, config_overrides={"impl": "warp", "budget": BUDGET, **options})
+def made(suite: str = "libero_object", task: int = 0, **options: Any) -> FunctionalLibero:
+    return FunctionalLibero(suite, task=task, config_overrides={"impl": "warp", "budget": BUDGET, **options})
 
 
 def keys(count: int = WORLDS, seed: int = 0) -> jax.Array:
     return jax.random.split(jax.random.key(seed), count)
 
 
-def wiggle(env: LiberoEnv, ticks: int, worlds: int = WORLDS) -> np.ndarray:
+def wiggle(env: FunctionalLibero, ticks: int, worlds: int = WORLDS) -> np.ndarray:
     return np.random.default_rng(0).uniform(-1, 1, (ticks, worlds, env.action_size)).astype(np.float32)
 
 
@@ -53,10 +60,10 @@ def types(tree: Any) -> Any:
 class Compiled:
     """One environment with its two functions over ``WORLDS`` worlds."""
 
-    def __init__(self, env: LiberoEnv) -> None:
+    def __init__(self, env: FunctionalLibero) -> None:
         self.env = env
-        self.reset: Callable[[jax.Array], State] = compiled(jax.vmap(env.reset))
-        self.step: Callable[[State, Any], State] = compiled(jax.vmap(env.step))
+        self.reset: Callable[[jax.Array], FunctionalState] = compiled(jax.vmap(env.reset))
+        self.step: Callable[[FunctionalState, Any], FunctionalState] = compiled(jax.vmap(env.step))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +72,7 @@ def plain() -> Compiled:
 
 
 @pytest.fixture
-def state(plain: Compiled) -> State:
+def state(plain: Compiled) -> FunctionalState:
     return plain.reset(keys())
 
 
@@ -98,7 +105,7 @@ def test_what_wrappers_add_to_a_state_stays_in_it(plain: Compiled) -> None:
     assert types(first) == types(then)
 
 
-def test_observations_hold_what_the_layout_says(plain: Compiled, state: State) -> None:
+def test_observations_hold_what_the_layout_says(plain: Compiled, state: FunctionalState) -> None:
     env, layout = plain.env, plain.env.layout
     assert layout["fixture_joints"].stop == env.observation_size
     obs, model = np.asarray(state.obs), env.mj_model
@@ -109,7 +116,7 @@ def test_observations_hold_what_the_layout_says(plain: Compiled, state: State) -
     np.testing.assert_allclose(obs[:, layout["target_offset"]], away, atol=0.01)
 
 
-def test_a_state_can_be_changed_by_path(state: State) -> None:
+def test_a_state_can_be_changed_by_path(state: FunctionalState) -> None:
     changed = state.tree_replace({"data.world.gripper": jnp.ones((WORLDS, 2)), "info.episode": 7, "done": 1})
     assert (changed.info["episode"], changed.done) == (7, 1)
     assert np.all(np.asarray(changed.data.world.gripper) == 1)
@@ -119,7 +126,7 @@ def test_a_state_can_be_changed_by_path(state: State) -> None:
 # -- stepping ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_same_call_gives_the_same_result_and_leaves_its_arguments(plain: Compiled, state: State) -> None:
+def test_the_same_call_gives_the_same_result_and_leaves_its_arguments(plain: Compiled, state: FunctionalState) -> None:
     before = jax.tree.map(np.array, state)
     action = wiggle(plain.env, 1)[0]
     once, twice = plain.step(state, action), plain.step(state, action)
@@ -129,10 +136,10 @@ def test_the_same_call_gives_the_same_result_and_leaves_its_arguments(plain: Com
     assert np.abs(np.asarray(once.data.qpos - state.data.qpos)).max() > 1e-4
 
 
-def test_it_steps_as_the_batched_environment_does(plain: Compiled, state: State) -> None:
+def test_it_steps_as_the_batched_environment_does(plain: Compiled, state: FunctionalState) -> None:
     episodes = np.asarray(state.info["episode"]).tolist()
     batched = vecenv.make("libero_object", tasks=[0] * WORLDS, episodes=[0], backend="warp", budget=BUDGET)
-    assert isinstance(batched, BatchedEnv)
+    assert isinstance(batched, LiberoEnv)
     batched.set_episodes(episodes=episodes)
     batched.reset()
     np.testing.assert_allclose(batched.state().qpos, state.data.qpos, atol=1e-6)
@@ -146,13 +153,13 @@ def test_it_steps_as_the_batched_environment_does(plain: Compiled, state: State)
     batched.close()
 
 
-def test_actions_that_are_no_numbers_count_as_zero_and_large_ones_are_clipped(plain: Compiled, state: State) -> None:
+def test_non_finite_actions_count_as_zero_and_large_ones_are_clipped(plain: Compiled, state: FunctionalState) -> None:
     odd = np.array([[np.nan, np.inf, 0, 0, 0, 0, 1], [9, -9, 0, 0, 0, 0, 9]], np.float32)
     even = np.array([[0, 0, 0, 0, 0, 0, 1], [1, -1, 0, 0, 0, 0, 1]], np.float32)
     np.testing.assert_allclose(plain.step(state, odd).data.qpos, plain.step(state, even).data.qpos, atol=1e-5)
 
 
-def test_a_failed_world_ends_alone_and_earns_nothing(plain: Compiled, state: State) -> None:
+def test_a_failed_world_ends_alone_and_earns_nothing(plain: Compiled, state: FunctionalState) -> None:
     broken = state.tree_replace({"data.qvel": state.data.qvel.at[0, 3].set(jnp.nan)})
     after = plain.step(broken, np.zeros((WORLDS, 7), np.float32))
     np.testing.assert_array_equal(after.done, [1, 0])
@@ -164,7 +171,7 @@ def test_a_failed_world_ends_alone_and_earns_nothing(plain: Compiled, state: Sta
     np.testing.assert_allclose(after.data.qpos[1], healthy.data.qpos[1], atol=1e-5)
 
 
-def test_success_ends_the_episode_and_pays_one(plain: Compiled, state: State) -> None:
+def test_success_ends_the_episode_and_pays_one(plain: Compiled, state: FunctionalState) -> None:
     env = plain.env
     soup = int(env.mj_model.joint("alphabet_soup_1_joint0").qposadr[0])
     basket = np.asarray(state.data.site_xpos[1, env.mj_model.site("basket_1_contain_region").id])
@@ -175,7 +182,7 @@ def test_success_ends_the_episode_and_pays_one(plain: Compiled, state: State) ->
     assert after.reward[1] > 1
 
 
-def test_a_batch_of_actions_for_one_world_is_refused(plain: Compiled, state: State) -> None:
+def test_a_batch_of_actions_for_one_world_is_refused(plain: Compiled, state: FunctionalState) -> None:
     with pytest.raises(FunctionalError, match=r"jax\.vmap"):
         plain.env.step(jax.tree.map(lambda x: x[0], state), jnp.zeros((WORLDS, 7)))
 
@@ -185,7 +192,7 @@ def test_worlds_do_not_depend_on_how_they_are_mapped() -> None:
     env = made(reward="shaped")
 
     def rollout(key: jax.Array) -> jax.Array:
-        def tick(state: State, action: jax.Array) -> tuple[State, jax.Array]:
+        def tick(state: FunctionalState, action: jax.Array) -> tuple[FunctionalState, jax.Array]:
             state = env.step(state, action)
             return state, state.obs
 
@@ -238,7 +245,7 @@ def test_a_scene_of_every_kind_resets_and_steps_in_pure_jax(scene_id: str) -> No
 def reset_and_step(scene_id: str, impl: str, geometry: str) -> None:
     suite, task = scene_id.rsplit("-", 1)
     options = {"impl": impl, "geometry": geometry, "reward": "shaped", "placement": "regions", "budget": ROOMY[impl]}
-    env = Compiled(LiberoEnv(suite, task=int(task), config_overrides=options))
+    env = Compiled(FunctionalLibero(suite, task=int(task), config_overrides=options))
     first = env.reset(keys())
     state = env.step(first, wiggle(env.env, 1)[0])
     assert types(state) == types(first)
@@ -295,9 +302,9 @@ def test_bad_options_are_named(options: dict[str, Any], message: str) -> None:
 
 def test_unknown_options_and_tasks_are_named() -> None:
     with pytest.raises(FunctionalError, match="num_worlds"):
-        LiberoEnv("libero_object", task=0, config_overrides={"num_worlds": 3})
+        FunctionalLibero("libero_object", task=0, config_overrides={"num_worlds": 3})
     with pytest.raises(UnknownTask, match="0 to 9"):
-        LiberoEnv("libero_object", task=10)
+        FunctionalLibero("libero_object", task=10)
 
 
 # -- domain randomisation ----------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from support.images import Reference, agreement, needs_gl
 from support.paths import DATA
 
 import vecenv
-from vecenv.libero.functional.env import FunctionalConfig, FunctionalError
+from vecenv.libero.functional import FunctionalConfig, FunctionalError
 from vecenv.libero.render import cameras, colors
 from vecenv.libero.render.gl import choose, open_context
 from vecenv.libero.render.options import RenderConfig, RenderError, VisualOptions

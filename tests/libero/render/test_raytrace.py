@@ -18,7 +18,7 @@ from support.images import needs_gl, psnr
 
 import vecenv
 from vecenv.contract import Egocentric
-from vecenv.libero.functional.env import FunctionalConfig, LiberoEnv
+from vecenv.libero.functional import FunctionalConfig, FunctionalLibero
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.mjx import backend as mjx
 from vecenv.libero.render import gl
@@ -305,7 +305,7 @@ def test_functional_observations_have_the_views_that_playground_expects() -> Non
         obs=("proprio", "pixels"),
         image_size=32,
     )
-    env = LiberoEnv("libero_spatial", task=0, config=config)
+    env = FunctionalLibero("libero_spatial", task=0, config=config)
     assert env.observation_size == {"state": (25,), "pixels/view_0": (32, 32, 3), "pixels/view_1": (32, 32, 3)}
     keys = jax.random.split(jax.random.key(0), 2)
     # Waited for: Python 3.11 cannot parse Warp's kernels in two threads at once.
@@ -326,8 +326,8 @@ def test_functional_images_have_the_colours_that_are_asked_for(tmp_path: Path) -
         scenery=str(tmp_path / "dark.npz"),
     )
     with pytest.raises(RenderError, match="made with colors='current' but colors='published' is requested"):
-        LiberoEnv("libero_spatial", task=0, config=config)
-    LiberoEnv("libero_spatial", task=0, config=dataclasses.replace(config, colors="current"))
+        FunctionalLibero("libero_spatial", task=0, config=config)
+    FunctionalLibero("libero_spatial", task=0, config=dataclasses.replace(config, colors="current"))
 
 
 # -- the batched environment -------------------------------------------------------------------------------------------

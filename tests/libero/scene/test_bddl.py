@@ -16,8 +16,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from vecenv.assets import libero_root
-from vecenv.libero.scene import bddl
-from vecenv.libero.scene.bddl import BDDLError, Instance, Predicate, Problem, Region, load_problem, parse_problem
+from vecenv.libero.scene import bddl_syntax
+from vecenv.libero.scene.bddl import Instance, Predicate, Problem, Region, load_problem, parse_problem
+from vecenv.libero.scene.bddl_syntax import BDDLError
 from vecenv.libero.tasks.suites import list_suites
 
 TASK_FILES = sorted((libero_root() / "bddl_files").rglob("*.bddl"))
@@ -338,12 +339,12 @@ def test_bytes_that_are_not_utf8_are_refused_where_they_are(tmp_path: Path) -> N
 
 
 def test_text_beyond_the_size_limit_is_refused(tmp_path: Path) -> None:
-    for padding, refused in ((bddl.MAX_CHARS - len(TEXT), False), (bddl.MAX_CHARS - len(TEXT) + 1, True)):
+    for padding, refused in ((bddl_syntax.MAX_CHARS - len(TEXT), False), (bddl_syntax.MAX_CHARS - len(TEXT) + 1, True)):
         path = tmp_path / f"{refused}.bddl"
         path.write_text(TEXT + " " * padding)
         with pytest.raises(BDDLError, match="at most") if refused else contextlib.nullcontext():
             load_problem(path)
-    path.write_bytes(b"\xff" * (4 * bddl.MAX_CHARS + 1))
+    path.write_bytes(b"\xff" * (4 * bddl_syntax.MAX_CHARS + 1))
     with pytest.raises(BDDLError, match="at most"):
         load_problem(path)
 
@@ -353,10 +354,10 @@ def test_nesting_beyond_the_limit_is_refused_at_the_first_level_too_many() -> No
         return TEXT.replace("on the plate", "(" * (depth - 2) + "x" + ")" * (depth - 2))
 
     with pytest.raises(BDDLError, match="expected a word"):
-        parse_problem(nested(bddl.MAX_DEPTH))
+        parse_problem(nested(bddl_syntax.MAX_DEPTH))
     with pytest.raises(BDDLError, match="expected at most 64 levels") as caught:
-        parse_problem(nested(bddl.MAX_DEPTH + 1))
-    assert (caught.value.line, caught.value.column) == (4, 6 + bddl.MAX_DEPTH - 2)
+        parse_problem(nested(bddl_syntax.MAX_DEPTH + 1))
+    assert (caught.value.line, caught.value.column) == (4, 6 + bddl_syntax.MAX_DEPTH - 2)
 
 
 def test_a_file_that_does_not_exist_is_an_os_error(tmp_path: Path) -> None:

@@ -225,7 +225,8 @@ def test_a_missing_mesh_is_reported_as_it_is_without_a_cache(
 
 def test_processes_that_compile_the_same_scene_do_not_disturb_each_other(folder: Path) -> None:
     code = (
-        "from vecenv.libero import suites, cache\n"
+        "from vecenv.libero.scene import cache\n"
+        "from vecenv.libero.tasks import suites\n"
         "for _ in range(5):\n"
         "    cache.cached_scene(suites.task('libero_goal', 0).problem())\n"
         "    [path.unlink(missing_ok=True) for path in cache.folder().glob('*.json')]\n"

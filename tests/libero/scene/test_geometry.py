@@ -11,9 +11,9 @@ from support import upstream
 
 from vecenv.libero.env import make
 from vecenv.libero.scene import goals
-from vecenv.libero.scene.lean import geometry, recipes
-from vecenv.libero.scene.lean import primitives as fits
-from vecenv.libero.scene.lean.primitives import FitError, Solid, box
+from vecenv.libero.scene.lean import boxes, capsules, detail, fits, geometry, recipes, vessels
+from vecenv.libero.scene.lean import solids as shapes
+from vecenv.libero.scene.lean.solids import FitError, Solid, box
 from vecenv.libero.scene.scene import Entity, Scene, SceneError, SceneSource, contact_sensor_name, scene_source
 from vecenv.libero.tasks import settled
 
@@ -311,13 +311,13 @@ def test_demands_say_what_tasks_do_with_things() -> None:
 def test_what_is_needed_comes_before_bystanders_and_detail() -> None:
     exact = exact_of("libero_spatial-0")
     plan = geometry.plan(exact, asked_of("libero_spatial-0"))
-    sizes = {name: recipes.count(parts) for name, parts in plan.parts.items()}
+    sizes = {name: detail.count(parts) for name, parts in plan.parts.items()}
     assert not plan.short
     assert sizes["akita_black_bowl_1"] >= 5 > sizes["akita_black_bowl_2"] == sizes["cookies_1"] == 1
     assert sum(sizes.values()) + 1 == plan.count <= geometry.MAX_GEOMS
     roomy = geometry.plan(exact, asked_of("libero_spatial-0"), budget=60)
-    assert recipes.count(roomy.parts["akita_black_bowl_1"]) == 9
-    assert recipes.count(roomy.parts["akita_black_bowl_2"]) == 1
+    assert detail.count(roomy.parts["akita_black_bowl_1"]) == 9
+    assert detail.count(roomy.parts["akita_black_bowl_2"]) == 1
 
 
 def test_a_budget_that_cannot_be_kept_is_an_error() -> None:
@@ -332,13 +332,13 @@ def test_a_tight_budget_says_what_falls_short() -> None:
 
 def test_an_unknown_category_is_made_of_its_own_boxes_or_merged_ones() -> None:
     few = recipes.recipe("teapot", 3).modules(frozenset({"held"}))[0]
-    assert [recipes.count(level) for level in few.levels] == [1, 2, 3]
+    assert [detail.count(level) for level in few.levels] == [1, 2, 3]
     many = recipes.recipe("teapot", 40).modules(frozenset())[0]
-    assert [recipes.count(level) for level in many.levels] == [1, 2, 3, 5, 8]
+    assert [detail.count(level) for level in many.levels] == [1, 2, 3, 5, 8]
 
 
 def test_a_recipe_that_does_not_fit_the_file_names_thing_and_geom(monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong = recipes.Recipe(((recipes.Part(recipes.Around(), ("g99",)),),))
+    wrong = detail.Recipe(((detail.Part(fits.Around(), ("g99",)),),))
     monkeypatch.setattr(recipes, "RECIPES", {"plate": wrong})
     with pytest.raises(SceneError, match="plate_1 has no collision geom 'g99'"):
         geometry.lean_scene(source_of("libero_goal-0"), {}, exact_of("libero_goal-0"))
@@ -367,7 +367,7 @@ LARGEST_GAP |= {"wooden_cabinet": (3.5, 12.0), "white_cabinet": (3.5, 12.0)}
 def test_needed_things_keep_their_surface(category: str) -> None:
     for finest, largest in zip((True, False), LARGEST_GAP.get(category, (3.5, 3.5)), strict=True):
         exact, lean = fitted(category, ALL_OF_IT, finest=finest)
-        gap = max(fits.gaps(exact, lean, 0.004).mean(), fits.gaps(lean, exact, 0.004).mean())
+        gap = max(shapes.gaps(exact, lean, 0.004).mean(), shapes.gaps(lean, exact, 0.004).mean())
         assert 1e3 * gap < largest
 
 
@@ -395,8 +395,8 @@ def test_hollow_things_stay_hollow(category: str) -> None:
     exact, lean = fitted(category, frozenset({asked}))
     ticks = [np.linspace(a, b, 9) for a, b in zip(low, high, strict=True)]
     space = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 3)
-    assert fits.union_distance(exact, space).min() > -1e-9, "the box is not free in the exact thing either"
-    assert fits.union_distance(lean, space).min() > -1e-9
+    assert shapes.union_distance(exact, space).min() > -1e-9, "the box is not free in the exact thing either"
+    assert shapes.union_distance(lean, space).min() > -1e-9
 
 
 # -- fits --------------------------------------------------------------------------------------------------------------
@@ -418,7 +418,7 @@ def ring(count: int, radius: float = 0.05) -> list[Solid]:
 
 def test_merging_the_halves_of_a_box_gives_the_box() -> None:
     halves = [upright((-0.01, 0, 0), (0.01, 0.02, 0.03)), upright((0.01, 0, 0), (0.01, 0.02, 0.03))]
-    (made,) = fits.merge(halves, 1, up=2)
+    (made,) = boxes.merge(halves, 1, up=2)
     np.testing.assert_allclose(made.pos, 0, atol=1e-12)
     np.testing.assert_allclose(np.sort(made.size), [0.02, 0.02, 0.03], atol=1e-9)
 
@@ -426,18 +426,18 @@ def test_merging_the_halves_of_a_box_gives_the_box() -> None:
 def test_merging_joins_what_lies_together() -> None:
     left = [upright((0, 0, z), (0.01, 0.01, 0.01)) for z in (0.01, 0.03)]
     right = [upright((0.3, 0, z), (0.01, 0.01, 0.01)) for z in (0.01, 0.03)]
-    made = fits.merge([left[0], right[0], left[1], right[1]], 2, up=2)
+    made = boxes.merge([left[0], right[0], left[1], right[1]], 2, up=2)
     assert sorted(round(float(solid.pos[0]), 6) for solid in made) == [0.0, 0.3]
 
 
 def test_a_vessel_is_found_and_made_again_with_fewer_walls() -> None:
     floor = upright((0, 0, 0.002), (0.03, 0.03, 0.002))
     handle = upright((0.08, 0, 0.03), (0.004, 0.004, 0.02))
-    found = fits.find_vessel([floor, *ring(16), handle])
+    found = vessels.find_vessel([floor, *ring(16), handle])
     assert (len(found.floor), len(found.wall), found.rest) == (1, 16, (handle,))
     np.testing.assert_allclose(found.centre, 0, atol=1e-9)
     assert found.inner == pytest.approx(0.004)
-    made = fits.vessel([floor, *ring(16), handle], walls=6, handles=1)
+    made = vessels.vessel([floor, *ring(16), handle], walls=6, handles=1)
     assert len(made) == 8
     assert made[0].extreme_points()[:, 2].min() == pytest.approx(0.0, abs=1e-9)
     radii = [np.linalg.norm(wall.pos[:2]) for wall in made[1:7]]
@@ -447,14 +447,14 @@ def test_a_vessel_is_found_and_made_again_with_fewer_walls() -> None:
 
 def test_what_has_no_walls_is_no_vessel() -> None:
     with pytest.raises(FitError, match="no vessel"):
-        fits.find_vessel([upright((0, 0, 0), (0.05, 0.05, 0.002))])
+        vessels.find_vessel([upright((0, 0, 0), (0.05, 0.05, 0.002))])
     with pytest.raises(FitError, match="handle"):
-        fits.vessel([upright((0, 0, 0.002), (0.03, 0.03, 0.002)), *ring(12)], walls=4, handles=1)
+        vessels.vessel([upright((0, 0, 0.002), (0.03, 0.03, 0.002)), *ring(12)], walls=4, handles=1)
 
 
 def test_a_column_has_the_height_and_outline_area_of_what_it_replaces() -> None:
-    cylinder = Solid(fits.CYLINDER, np.zeros(3), np.eye(3), np.array([0.03, 0.05, 0.0]))
-    made = fits.column([cylinder], up=2)
+    cylinder = Solid(shapes.CYLINDER, np.zeros(3), np.eye(3), np.array([0.03, 0.05, 0.0]))
+    made = boxes.column([cylinder], up=2)
     corners = np.concatenate([solid.extreme_points() for solid in made])
     np.testing.assert_allclose(np.abs(corners[:, 2]), 0.05)
     radii = np.linalg.norm(corners[:, :2], axis=1)
@@ -464,12 +464,12 @@ def test_a_column_has_the_height_and_outline_area_of_what_it_replaces() -> None:
 
 def test_an_end_capsule_is_flush_with_the_end_and_stays_within_the_sides() -> None:
     finger = upright((0, 0.01, 0.03), (0.008, 0.006, 0.03))
-    made = fits.end_capsule([finger], np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
+    made = capsules.end_capsule([finger], np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
     points = made.extreme_points()
     assert points[:, 2].max() == pytest.approx(0.06)
     assert points[:, 1].min() == pytest.approx(0.004, abs=2e-4)
     palm = upright((0, 0, 0.03), (0.1, 0.02, 0.03))
-    across = fits.end_capsule([palm], np.array([0.0, 0.0, 1.0]))
+    across = capsules.end_capsule([palm], np.array([0.0, 0.0, 1.0]))
     assert abs(across.mat[0, 2]) == pytest.approx(1.0)
     assert across.size[0] == pytest.approx(0.02)
     assert across.extreme_points()[:, 2].max() == pytest.approx(0.06, abs=1e-3)
@@ -479,9 +479,9 @@ def test_distances_are_signed_and_gaps_vanish_for_the_same_shape() -> None:
     cube = upright((0, 0, 0), (0.01, 0.01, 0.01))
     at = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.02, 0, 0], [0.02, 0.02, 0]])
     np.testing.assert_allclose(cube.distance(at), [-0.01, 0, 0.01, 0.01 * np.sqrt(2)], atol=1e-12)
-    rod = fits.capsule(np.zeros(3), np.array([0.0, 0.0, 0.1]), 0.01)
+    rod = shapes.capsule(np.zeros(3), np.array([0.0, 0.0, 0.1]), 0.01)
     np.testing.assert_allclose(rod.distance(np.array([[0.02, 0, 0.05], [0, 0, 0.12]])), 0.01, atol=1e-12)
-    assert fits.gaps([cube], [cube]).max() < 1e-12
+    assert shapes.gaps([cube], [cube]).max() < 1e-12
 
 
 # -- with a policy -----------------------------------------------------------------------------------------------------

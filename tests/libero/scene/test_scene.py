@@ -343,7 +343,7 @@ def test_a_task_that_has_no_model_is_refused_by_name(text: str, message: str) ->
 
 
 def test_a_scene_that_mujoco_rejects_names_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vecenv.libero.scene.scene.ARENA_MEMORY", "plenty")
+    monkeypatch.setattr("vecenv.libero.scene.elements.ARENA_MEMORY", "plenty")
     with pytest.raises(SceneError, match=r"moon\.bddl: MuJoCo rejects"):
         compile_scene(parse_problem(upstream.task_text("libero_floor_manipulation"), "moon.bddl"))
 

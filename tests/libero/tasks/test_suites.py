@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from vecenv.assets import libero_root
-from vecenv.libero.scene.bddl import BDDLError
+from vecenv.libero.scene.bddl_syntax import BDDLError
 from vecenv.libero.tasks.suites import (
     BASE_SUITES,
     NUM_EPISODES,

@@ -1,14 +1,27 @@
 """One LIBERO environment as pure functions of one world, for JAX training loops."""
 
-from vecenv.libero.functional.env import (
-    Data,
+from vecenv.libero.functional.config import (
+    ACTIONS,
+    PLACEMENTS,
     FunctionalConfig,
     FunctionalError,
-    LiberoEnv,
-    State,
     default_config,
-    jit,
-    randomize,
 )
+from vecenv.libero.functional.env import FunctionalLibero
+from vecenv.libero.functional.randomize import Randomization, randomize
+from vecenv.libero.functional.state import Data, FunctionalState
+from vecenv.libero.physics.mjx.backend import jit
 
-__all__ = ["Data", "FunctionalConfig", "FunctionalError", "LiberoEnv", "State", "default_config", "jit", "randomize"]
+__all__ = [
+    "ACTIONS",
+    "PLACEMENTS",
+    "Data",
+    "FunctionalConfig",
+    "FunctionalError",
+    "FunctionalLibero",
+    "FunctionalState",
+    "Randomization",
+    "default_config",
+    "jit",
+    "randomize",
+]

@@ -20,12 +20,13 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from vecenv.errors import InvalidInput
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.scene import Scene
-from vecenv.util.rotations import safe_norm
+from vecenv.util.rotations import quat_to_mat, safe_norm
 
 OBJECTIVES = ("goal", "reach", "lift")
 
@@ -55,14 +56,14 @@ class View(NamedTuple):
         start_height: height of the target's origin when the episode began, metres.
     """
 
-    qpos: jax.Array
-    xpos: jax.Array
-    xquat: jax.Array
-    site_xpos: jax.Array
-    site_xmat: jax.Array
-    touch: jax.Array
-    gripper: jax.Array
-    start_height: jax.Array
+    qpos: Float[Array, " nq"]
+    xpos: Float[Array, "nbody 3"]
+    xquat: Float[Array, "nbody 4"]
+    site_xpos: Float[Array, "nsite 3"]
+    site_xmat: Float[Array, "nsite 3 3"]
+    touch: Float[Array, " nsensordata"]
+    gripper: Float[Array, "2"]
+    start_height: Float[Array, ""]
 
 
 class Box(NamedTuple):
@@ -166,15 +167,15 @@ class Objective:
         self._table = goals.GoalTable(*(np.asarray(column) for column in table))
         self._subjects = [body_box(scene.model, body) for body in _subjects(scene.model, self._table)]
 
-    def height(self, view: View) -> jax.Array:
+    def height(self, view: View) -> Float[Array, ""]:
         """Height of the target's origin, metres."""
         return view.xpos[self.box.body, 2]
 
-    def offset(self, view: View) -> jax.Array:
+    def offset(self, view: View) -> Float[Array, "3"]:
         """From the point between the fingertips to the centre of the target's box, metres, world frame, [3]."""
         return _centre(view, self.box) - self._grip(view)
 
-    def success(self, view: View) -> jax.Array:
+    def success(self, view: View) -> Bool[Array, ""]:
         """Whether the objective is achieved, bool."""
         if self.kind == "reach":
             return _distance(view, self.box, self._grip(view)) <= self._reach_distance
@@ -182,7 +183,7 @@ class Objective:
             return self.height(view) - view.start_height >= self._lift_height
         return jnp.all(self._holds(view))
 
-    def potential(self, view: View) -> jax.Array:
+    def potential(self, view: View) -> Float[Array, ""]:
         """How near the objective is, in [0, 1].
 
         ``reach``: the score of the distance to the box, see ``reach_distance``.
@@ -195,23 +196,23 @@ class Objective:
             return _score(_distance(view, self.box, self._grip(view)))
         return self._lifted(view) if self.kind == "lift" else self._towards_goal(view)
 
-    def _grip(self, view: View) -> jax.Array:
+    def _grip(self, view: View) -> Float[Array, "3"]:
         return view.site_xpos[self._grip_site]
 
-    def _lifted(self, view: View) -> jax.Array:
+    def _lifted(self, view: View) -> Float[Array, ""]:
         away = safe_norm(_grasp_point(view, self.box) - self._grip(view))
         closing = jnp.exp(-((away / _GRASP_RADIUS) ** 2)) * (1 - view.gripper[0]) / 2
         gained = jnp.clip((self.height(view) - view.start_height) / self._lift_height, 0, 1)
         return 0.3 * _score(away) + 0.2 * closing + 0.5 * gained
 
-    def _towards_goal(self, view: View) -> jax.Array:
+    def _towards_goal(self, view: View) -> Float[Array, ""]:
         holds = self._holds(view)
         placed = jnp.stack([_score(self._missing(view, i)) for i in range(len(self._subjects))])
         near = jnp.stack([_score(_distance(view, box, self._grip(view))) for box in self._subjects])
         first = jnp.arange(len(holds)) == jnp.argmin(holds)
         return jnp.mean(jnp.where(holds, 1.0, 0.6 * placed + 0.3 * jnp.where(first, near, 0.0)))
 
-    def _holds(self, view: View) -> jax.Array:
+    def _holds(self, view: View) -> Bool[Array, " P"]:
         """Which predicates of the goal hold, bool [P]."""
         table = jax.tree.map(jnp.asarray, self._table)
         return goals.predicates(
@@ -224,7 +225,7 @@ class Objective:
             xp=jnp,
         )[0]
 
-    def _missing(self, view: View, index: int) -> jax.Array:
+    def _missing(self, view: View, index: int) -> Float[Array, ""]:
         """How far the thing of one predicate is from its place, metres, or a joint from its bound."""
         row = goals.GoalTable(*(column[0, index] for column in self._table))
         if row.kind in (goals.ANY_JOINT, goals.ALL_JOINTS):
@@ -251,33 +252,27 @@ def _subjects(model: mujoco.MjModel, table: goals.GoalTable) -> list[int]:
     ]
 
 
-def _score(distance: jax.Array) -> jax.Array:
+def _score(distance: Float[Array, ""]) -> Float[Array, ""]:
     return 1 - jnp.tanh(_SHARPNESS * distance)
 
 
-def _axes(view: View, body: int) -> jax.Array:
-    """Rotation matrix of a body, [3, 3]; from the quaternion, which is all that is kept."""
-    w, x, y, z = view.xquat[body]
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return jnp.stack([jnp.stack(row) for row in rows])
+def _axes(view: View, body: int) -> Float[Array, "3 3"]:
+    """Rotation matrix of a body; from the quaternion, which is all that is kept."""
+    return quat_to_mat(view.xquat[body])
 
 
-def _centre(view: View, box: Box) -> jax.Array:
+def _centre(view: View, box: Box) -> Float[Array, "3"]:
     return view.xpos[box.body] + jnp.sum(_axes(view, box.body) * box.centre, axis=-1)
 
 
-def _distance(view: View, box: Box, point: jax.Array) -> jax.Array:
+def _distance(view: View, box: Box, point: Float[Array, "3"]) -> Float[Array, ""]:
     """From a point to a box, metres; 0 inside."""
     axes = _axes(view, box.body)
     local = jnp.sum(axes * (point - view.xpos[box.body])[:, None], axis=0) - box.centre
     return safe_norm(jnp.maximum(jnp.abs(local) - box.half, 0.0))
 
 
-def _grasp_point(view: View, box: Box) -> jax.Array:
+def _grasp_point(view: View, box: Box) -> Float[Array, "3"]:
     """Where a hand from above takes hold: on the box's vertical middle line, near its top."""
     half_height = jnp.sum(jnp.abs(_axes(view, box.body)[2]) * box.half)
     return _centre(view, box) + jnp.maximum(half_height - _GRASP_DEPTH, 0.0) * jnp.asarray([0.0, 0.0, 1.0])

@@ -21,6 +21,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import numpy.typing as npt
+from jaxtyping import Array, Float, Int
 
 from vecenv.errors import InvalidInput
 from vecenv.libero.scene import surface
@@ -29,6 +31,7 @@ from vecenv.libero.scene.scene import Entity, Scene
 from vecenv.libero.tasks import fixtures
 from vecenv.libero.tasks.fixtures import FixturePlacement
 from vecenv.libero.tasks.settled import SettledStarts
+from vecenv.util.rotations import quat_conjugate, quat_mul, rotate
 
 LAYOUTS = 64
 # Round things are taken this much smaller: bowls and plates flare, and where their rims would meet there is still room
@@ -50,11 +53,11 @@ class Begin(NamedTuple):
         episode: index of the stored start it is, or was made from, int32.
     """
 
-    qpos: jax.Array
-    qvel: jax.Array
-    body_pos: jax.Array
-    body_quat: jax.Array
-    episode: jax.Array
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    body_pos: Float[Array, "nbody 3"]
+    body_quat: Float[Array, "nbody 4"]
+    episode: Int[Array, ""]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +92,8 @@ class _Footprints(NamedTuple):
 class _Layout(NamedTuple):
     """Places of n things: ``spot`` of the root body's origin, metres, [..., n, 2], and ``yaw``, radians, [..., n]."""
 
-    spot: jax.Array
-    yaw: jax.Array
+    spot: Float[Array, "*n 2"]
+    yaw: Float[Array, "*n"]
 
 
 class Starts:
@@ -177,24 +180,24 @@ class Starts:
         places = [_draw(thing.placement, key) for thing, key in zip(self._things, keys, strict=True)]
         return _Layout(*(jnp.stack(parts) for parts in zip(*places, strict=True)))
 
-    def _move_fixture(self, begin: Begin, thing: _Thing, spot: jax.Array, yaw: jax.Array) -> Begin:
+    def _move_fixture(self, begin: Begin, thing: _Thing, spot: Float[Array, "2"], yaw: Float[Array, ""]) -> Begin:
         body = thing.placement.body
         old_pos, old_quat = begin.body_pos[body], begin.body_quat[body]
         pos = jnp.concatenate([spot, _real(thing.placement.origin[2:])])
         zero = jnp.zeros_like(yaw)
         quat = jnp.stack([jnp.cos(yaw / 2), zero, zero, jnp.sin(yaw / 2)])
-        turn = _product(quat, _conjugate(old_quat))
+        turn = quat_mul(quat, quat_conjugate(old_quat))
         qpos = begin.qpos
         for entity in thing.carried:
             at = self._scene.model.joint(entity.joints[0]).qposadr[0]
-            qpos = qpos.at[at : at + 3].set(pos + _rotate(turn, qpos[at : at + 3] - old_pos))
-            qpos = qpos.at[at + 3 : at + 7].set(_product(turn, qpos[at + 3 : at + 7]))
+            qpos = qpos.at[at : at + 3].set(pos + rotate(turn, qpos[at : at + 3] - old_pos))
+            qpos = qpos.at[at + 3 : at + 7].set(quat_mul(turn, qpos[at + 3 : at + 7]))
         moved = begin._replace(
             qpos=qpos, body_pos=begin.body_pos.at[body].set(pos), body_quat=begin.body_quat.at[body].set(quat)
         )
         return self._at_rest(moved, thing.carried)
 
-    def _move_object(self, begin: Begin, thing: _Thing, spot: jax.Array, yaw: jax.Array) -> Begin:
+    def _move_object(self, begin: Begin, thing: _Thing, spot: Float[Array, "2"], yaw: Float[Array, ""]) -> Begin:
         del yaw  # an object's orientation is that of the settled start
         at = self._scene.model.joint(thing.entity.joints[0]).qposadr[0]
         shift, qpos = spot - begin.qpos[at : at + 2], begin.qpos
@@ -276,7 +279,7 @@ def _footprint(scene: Scene, data: mujoco.MjData, entity: Entity) -> tuple[np.nd
     return centre, half, radius * (_FLARE if is_round else 1.0)
 
 
-def _draw(placement: FixturePlacement, rng: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _draw(placement: FixturePlacement, rng: jax.Array) -> tuple[Float[Array, "2"], Float[Array, ""]]:
     """A place [2] and yaw, uniform in one of the rectangles."""
     which, where = jax.random.split(rng)
     ranges = _real(placement.ranges)
@@ -306,22 +309,6 @@ def _reach(axes: jax.Array, half: jax.Array, along: jax.Array) -> jax.Array:
     return jnp.sum(half * jnp.abs(jnp.sum(axes * along[..., None, :], -1)), -1)
 
 
-def _real(values: Any) -> jax.Array:
+def _real(values: npt.ArrayLike) -> jax.Array:
     """As floats of JAX's default width."""
     return jnp.asarray(values, jnp.result_type(float))
-
-
-def _conjugate(quat: jax.Array) -> jax.Array:
-    return quat * jnp.asarray([1.0, -1.0, -1.0, -1.0], quat.dtype)
-
-
-def _product(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Hamilton product of quaternions wxyz [4]."""
-    scalar = a[0] * b[0] - jnp.sum(a[1:] * b[1:])
-    return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
-
-
-def _rotate(quat: jax.Array, v: jax.Array) -> jax.Array:
-    """A vector [3] turned by a unit quaternion wxyz [4]."""
-    t = 2 * jnp.cross(quat[1:], v)
-    return v + quat[0] * t + jnp.cross(quat[1:], t)

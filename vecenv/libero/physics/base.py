@@ -280,7 +280,7 @@ class Physics(ABC):
 
     def follow(
         self,
-        plan: waypoint.Plan,
+        plan: waypoint.WaypointPlan,
         active: np.ndarray,
         limit: np.ndarray,
         config: waypoint.WaypointConfig,

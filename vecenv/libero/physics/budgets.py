@@ -24,7 +24,8 @@ import numpy as np
 from vecenv.errors import InvalidInput
 from vecenv.libero.physics.base import Group, Start
 from vecenv.libero.scene import cache
-from vecenv.libero.scene.scene import CONTACT_LIMIT, PAIR_LIMIT, Scene
+from vecenv.libero.scene.elements import CONTACT_LIMIT, PAIR_LIMIT
+from vecenv.libero.scene.scene import Scene
 
 # Factors on the most that was seen. Two boxes of published contacts have up to eight, and how many changes from substep
 # to substep while fingers press: 1.3 times the rows were too few for libero_10 task 0 (5 of 10 episodes of pick_place).

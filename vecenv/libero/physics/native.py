@@ -33,7 +33,8 @@ from mujoco.batch import Batch, SimulationError
 from vecenv.controllers.osc_numba import ArmViews, Controllers
 from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Physics, Start
 from vecenv.libero.physics.colliders import install as collider
-from vecenv.libero.scene.scene import ARM_JOINTS, HOME_QPOS, Scene
+from vecenv.libero.robot import ARM_JOINTS, HOME_QPOS
+from vecenv.libero.scene.scene import Scene
 from vecenv.util.cores import usable_cores
 
 # Slots a thread steps at a time. Eight simulations stay in a core's cache; fewer spend more on calls.

@@ -44,7 +44,7 @@ from vecenv.libero.render.ray_shapes import make_nearest
 from vecenv.libero.render.ray_types import Cameras, Geoms, Hit, Images, Lights, Materials, Ray, Surface
 
 if TYPE_CHECKING:
-    from mujoco.mjx.third_party.mujoco_warp import RenderContext
+    from vecenv.libero.physics.mjx.private import RenderContext
 
 _MIRROR_TYPES = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_BOX)
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)

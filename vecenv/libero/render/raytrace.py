@@ -32,7 +32,7 @@ from vecenv.util.mapped import Sized
 from vecenv.util.rotations import quat_to_mat
 
 if TYPE_CHECKING:
-    from mujoco.mjx.third_party.mujoco_warp import RenderContext
+    from vecenv.libero.physics.mjx.private import RenderContext
 
 _LookKey = tuple[SceneKey, tuple[str, ...], Wanted]
 # Threads of a block on the GPU, registers of a thread, and the tile of pixels, rows and columns, that threads next to

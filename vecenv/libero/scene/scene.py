@@ -11,7 +11,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from types import MappingProxyType
 
 import mujoco
@@ -19,29 +18,11 @@ import numpy as np
 
 from vecenv import assets
 from vecenv.errors import InvalidInput
-from vecenv.libero.scene import catalog, contacts, mjcf
+from vecenv.libero.robot import ARM_JOINTS, BASE_BODY, FINGER_JOINTS, GRIP_SITE, HAND_BODY
+from vecenv.libero.scene import catalog, contacts, elements, mjcf
 from vecenv.libero.scene.arenas import ARENAS, Arena
 from vecenv.libero.scene.bddl import Problem, Region
 from vecenv.libero.scene.contacts import Contacts
-
-# Robot pose at reset, radians (robosuite's Panda as LIBERO mounts it).
-HOME_QPOS = np.array([0.0, -1.61037389e-01, 0.0, -2.44459747, 0.0, 2.22675220, np.pi / 4])
-HOME_FINGER_QPOS = np.array([0.020833, -0.020833])
-ARM_DAMPING = (0.1, 0.1, 0.1, 0.1, 0.1, 0.01, 0.01)
-ARM_FRICTIONLOSS = 0.1
-ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
-FINGER_JOINTS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
-GRIP_SITE = "gripper0_grip_site"
-HAND_BODY = "robot0_right_hand"
-BASE_BODY = "robot0_base"
-
-# Memory of one simulation's contacts and constraints, allocated as it is used. The 32 scenes use 1.3 MB at most in the
-# first 60 substeps of their starts with all fixtures in one place. A full arena is reported as a fault, never ignored.
-ARENA_MEMORY = "16M"
-
-# Custom numerics that MJX's pure-JAX implementation reads its limits from; -1 is none
-# (``vecenv.libero.physics.budgets``).
-CONTACT_LIMIT, PAIR_LIMIT = "max_contact_points", "max_geom_pairs"
 
 _ZONE_HALF_HEIGHT = 0.007
 
@@ -96,9 +77,9 @@ class Entity:
     radius: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """A compiled scene.
+    """A compiled scene, equal only to itself.
 
     Attributes:
         problem_name: LIBERO's problem class, lower case.
@@ -214,7 +195,7 @@ def scene_source(
 ) -> SceneSource:
     """Put the MJCF of a problem together; arguments and errors as for ``compile_scene``."""
     builder = _Builder(problem)
-    _choose_contacts(builder.root, contacts)
+    elements.choose_contacts(builder.root, contacts)
     builder.add_contact_sensors(contact_pairs)
     if not visual:
         mjcf.remove_visuals(builder.root)
@@ -265,7 +246,7 @@ class _Builder:
         self.robosuite = assets.robosuite_assets_root()
         self.entities: dict[str, Entity] = {}
         self.regions: dict[str, RegionSite] = {}
-        self.root = _base()
+        self.root = elements.base()
         try:
             self._assemble()
         except (mjcf.MjcfError, catalog.UnknownCategory, SceneError) as error:
@@ -283,7 +264,7 @@ class _Builder:
         for region in self.problem.regions:
             self._add_region(region, table, [tree for tree, _ in bodies])
         mjcf.merge(self.root, arena_tree)
-        mjcf.merge(self.root, _robot(self.robosuite, self.arena))
+        mjcf.merge(self.root, elements.robot(self.robosuite, self.arena))
         world = mjcf.section(self.root, "worldbody")
         for tree, source in bodies:
             mjcf.merge_assets(self.root, source)
@@ -302,8 +283,8 @@ class _Builder:
     def _arena_tree(self) -> ET.Element:
         root = mjcf.load(self.libero / self.arena.scene_xml)
         if self.arena.table is not None:
-            _resize_table(root, self.arena)
-        _set_textures(root, self.arena)
+            elements.resize_table(root, self.arena)
+        elements.set_textures(root, self.arena)
         world = mjcf.section(root, "worldbody")
         for camera in self.arena.cameras:
             element = world.find(f"camera[@name='{camera.name}']")
@@ -408,99 +389,3 @@ def _outer_site(source: ET.Element, name: str) -> tuple[float, float, float]:
 def _vec3(text: str) -> tuple[float, float, float]:
     x, y, z = mjcf.numbers(text)
     return x, y, z
-
-
-def _choose_contacts(root: ET.Element, chosen: Contacts) -> None:
-    """Write the mark of chosen contacts into an MJCF tree; errors of ``contacts.checked``."""
-    if contacts.checked(chosen) == "current":
-        return
-    numeric = root.find(f"custom/numeric[@name='{contacts.NUMERIC}']")
-    assert numeric is not None
-    numeric.set("data", repr(contacts.MARK))
-
-
-def _base() -> ET.Element:
-    """The options every robosuite 1.4.0 scene is compiled with."""
-    root = ET.Element("mujoco", {"model": "libero"})
-    ET.SubElement(root, "compiler", {"angle": "radian", "inertiagrouprange": "0 0"})
-    ET.SubElement(
-        root,
-        "option",
-        {"timestep": "0.002", "impratio": "20", "cone": "elliptic", "density": "1.2", "viscosity": "0.00002"},
-    )
-    ET.SubElement(root, "size", {"memory": ARENA_MEMORY})
-    visual = ET.SubElement(root, "visual")
-    ET.SubElement(visual, "map", {"znear": "0.001"})
-    custom = ET.SubElement(root, "custom")
-    ET.SubElement(custom, "numeric", {"name": contacts.NUMERIC, "data": "0"})
-    for name in (CONTACT_LIMIT, PAIR_LIMIT):
-        ET.SubElement(custom, "numeric", {"name": name, "data": "-1"})
-    for tag in ("asset", "worldbody", "actuator", "sensor"):
-        ET.SubElement(root, tag)
-    return root
-
-
-def _resize_table(root: ET.Element, arena: Arena) -> None:
-    assert arena.table is not None
-    half = np.array(arena.table.full_size) / 2
-    table = mjcf.body(root, arena.table_body)
-    table.set("pos", mjcf.text(np.array([0, 0, -half[2]]) + arena.workspace_offset))
-    for geom in table.findall("geom"):
-        name = geom.get("name", "")
-        if name in ("table_collision", "table_visual"):
-            geom.set("size", mjcf.text(half))
-        if name == "table_collision":
-            geom.set("friction", mjcf.text(arena.table.friction))
-    for site in table.findall("site[@name='table_top']"):
-        site.set("pos", mjcf.text((0, 0, half[2])))
-    _place_legs(table, arena, half)
-
-
-def _place_legs(table: ET.Element, arena: Arena, half: np.ndarray) -> None:
-    """Visual legs, inset by 0.1 m from the table's corners."""
-    leg = (arena.workspace_offset[2] - half[2]) / 2
-    for index, (dx, dy) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1)), start=1):
-        geom = table.find(f"geom[@name='table_leg{index}_visual']")
-        if geom is not None:
-            geom.set("pos", mjcf.text((dx * (half[0] - 0.1), dy * (half[1] - 0.1), -leg)))
-            geom.set("size", mjcf.text((0.025, leg)))
-
-
-def _set_textures(root: ET.Element, arena: Arena) -> None:
-    for name, file in (("texplane", arena.floor_texture), ("tex-wall", arena.wall_texture)):
-        texture = root.find(f"asset/texture[@name='{name}']")
-        if texture is not None:
-            texture.set("file", str(Path(texture.attrib["file"]).with_name(file)))
-
-
-def _robot(robosuite_root: Path, arena: Arena) -> ET.Element:
-    """The Panda with its gripper and mount, named and tuned as robosuite does it."""
-    arm = mjcf.load(robosuite_root / "robots" / "panda" / "robot.xml")
-    for index, joint in enumerate(arm.iter("joint")):
-        joint.set("damping", mjcf.text((ARM_DAMPING[index],)))
-        joint.attrib.setdefault("frictionloss", mjcf.text((ARM_FRICTIONLOSS,)))
-        joint.attrib.setdefault("armature", mjcf.text((5.0 / (index + 1),)))
-    _name_geoms(arm)
-    mjcf.add_prefix(arm, "robot0_")
-    mjcf.body(arm, BASE_BODY).set("pos", mjcf.text(arena.robot_base))
-
-    gripper = mjcf.load(robosuite_root / "grippers" / "panda_gripper.xml")
-    mjcf.add_prefix(gripper, "gripper0_")
-    mjcf.merge(arm, gripper, into=mjcf.body(arm, HAND_BODY))
-
-    mount = mjcf.load(robosuite_root / "mounts" / ("rethink_mount.xml" if arena.mounted else "null_mount.xml"))
-    mjcf.add_prefix(mount, "mount0_")
-    mjcf.body(mount, "mount0_base").set("pos", "0 0 0.01" if arena.mounted else "0 0 0")
-    mjcf.merge(arm, mount, into=mjcf.body(arm, BASE_BODY))
-    # The wrist force and torque sensors cost a full inverse-dynamics pass a step and nothing here reads them.
-    arm.remove(mjcf.section(arm, "sensor"))
-    return arm
-
-
-def _name_geoms(root: ET.Element) -> None:
-    counts = {"col": 0, "vis": 0}
-    for geom in root.iter("geom"):
-        if geom.get("name") is None:
-            kind = "vis" if geom.get("group") == "1" else "col"
-            geom.set("name", f"g{counts[kind]}_{kind}")
-            counts[kind] += 1

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from vecenv.libero.scene.scene import BASE_BODY, Scene
+from vecenv.libero.robot import BASE_BODY
+from vecenv.libero.scene.scene import Scene
 
 # The planned density; every entity gets at least MIN_POINTS.
 POINTS_PER_ENTITY = 320

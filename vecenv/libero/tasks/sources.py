@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from vecenv.libero.tasks.settled import SettledStarts
 from vecenv.libero.tasks.suites import TaskSpec, list_tasks
 
 
+@runtime_checkable
 class Task(Protocol):
     """One task of a suite, as an environment needs it."""
 

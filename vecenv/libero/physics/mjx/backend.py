@@ -32,8 +32,9 @@ from vecenv.errors import InvalidInput
 from vecenv.libero.physics import budgets, newton
 from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Followed, Physics, Ran, Start, Watcher
 from vecenv.libero.physics.mjx import contacts as mjx_contacts
+from vecenv.libero.robot import HOME_QPOS, panda_chain
 from vecenv.libero.scene import cache, contacts, goals
-from vecenv.libero.scene.scene import HOME_QPOS, Scene
+from vecenv.libero.scene.scene import Scene
 from vecenv.util.devices import Spread, replicated
 from vecenv.util.rotations import quat_to_mat
 
@@ -227,7 +228,7 @@ def build(
     put = mjx_contacts.put_model(model, impl=chosen)
     if chosen == "warp":
         put = put.replace(opt=put.opt.tree_replace({"_impl.warn_overflow": 0}))
-    chain = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), kinematics.chain_from_model(scene.model))
+    chain = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), panda_chain(scene.model))
     home_qpos = jnp.array([*HOME_QPOS, 0.0, 0.0], jnp.result_type(float))
     home = jax.jit(kinematics.arm_state)(chain, home_qpos, jnp.zeros_like(home_qpos))
     return Build(scene=scene, model=model, impl=chosen, budget=budget, system=System(put, chain, home, touching))
@@ -590,7 +591,7 @@ def follow_plan(
     system: System,
     table: goals.GoalTable,
     worlds: World,
-    plan: waypoint.Plan,
+    plan: waypoint.WaypointPlan,
     active: jax.Array,
     limit: jax.Array,
     max_misses: jax.Array,
@@ -717,7 +718,7 @@ def _follow(
     max_misses: jax.Array,
     table: goals.GoalTable,
     worlds: World,
-    plan: waypoint.Plan,
+    plan: waypoint.WaypointPlan,
     active: jax.Array,
     limit: jax.Array,
     **options: Any,
@@ -953,7 +954,7 @@ class MjxPhysics(Physics):
 
     def follow(
         self,
-        plan: waypoint.Plan,
+        plan: waypoint.WaypointPlan,
         active: np.ndarray,
         limit: np.ndarray,
         config: waypoint.WaypointConfig,

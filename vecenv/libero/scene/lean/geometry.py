@@ -5,7 +5,7 @@ masses, inertias, actuators and sensors, bit for bit, but other collision geoms.
 could collide, so their number decides what a step costs. How much detail a thing gets depends on what tasks do with it:
 what is picked up or filled stays as it must be, more detail goes to what is needed while the budget lasts, bystanders
 become one or two boxes. The shapes are data (``vecenv.libero.scene.lean.recipes``), the fits are in
-``vecenv.libero.scene.lean.primitives``. The result is a pure function of the source and :func:`demands`;
+``vecenv.libero.scene.lean.fits``. The result is a pure function of the source and :func:`demands`;
 :func:`lean_key` names what else it depends on.
 """
 
@@ -22,9 +22,11 @@ import numpy as np
 
 from vecenv.libero.scene import catalog, contacts
 from vecenv.libero.scene.bddl import Predicate, Problem
-from vecenv.libero.scene.lean import primitives as fits
-from vecenv.libero.scene.lean.primitives import Solid
-from vecenv.libero.scene.lean.recipes import ROBOT_ARM, ROBOT_HAND, Module, Part, count, recipe
+from vecenv.libero.scene.lean import boxes
+from vecenv.libero.scene.lean import solids as shapes
+from vecenv.libero.scene.lean.detail import Module, Part, count
+from vecenv.libero.scene.lean.recipes import ROBOT_ARM, ROBOT_HAND, recipe
+from vecenv.libero.scene.lean.solids import Solid
 from vecenv.libero.scene.scene import Entity, Scene, SceneError, SceneSource
 
 PROFILES = ("exact", "lean")
@@ -224,7 +226,7 @@ def fit_part(scene: Scene, name: str, part: Part) -> Fitted:
     like = geoms[int(np.argmax([np.prod(solid.half_extents) for solid in solids]))]
     try:
         made = tuple(part.fit(solids))
-    except fits.FitError as error:
+    except shapes.FitError as error:
         raise SceneError(f"{name}: {error}") from error
     return Fitted(body, made, like, part.meets or _meets(scene, name, body))
 
@@ -299,7 +301,7 @@ class _Rebuild:
             return body, self.model.geom_pos[geoms[0]].copy(), self.model.geom_size[geoms[0]].copy(), geoms[0]
         like = max(geoms, key=lambda g: float(_level_area(solid_of(self.model, g))))
         body = int(self.model.geom_bodyid[like])
-        top = fits.bound([solid_of(self.model, like)], np.eye(3))
+        top = boxes.bound([solid_of(self.model, like)], np.eye(3))
         pos = top.pos + [0.0, 0.0, top.size[2]]
         return body, pos, np.array([*top.size[:2], 0.01]), like
 
@@ -370,12 +372,12 @@ class _Rebuild:
                 self.spec.delete(mesh)
 
 
-_TYPES = {fits.BOX: mujoco.mjtGeom.mjGEOM_BOX, fits.CAPSULE: mujoco.mjtGeom.mjGEOM_CAPSULE}
+_TYPES = {shapes.BOX: mujoco.mjtGeom.mjGEOM_BOX, shapes.CAPSULE: mujoco.mjtGeom.mjGEOM_CAPSULE}
 
 
 def _level_area(solid: Solid) -> float:
     """Area of a solid's box seen from above."""
-    around = fits.bound([solid], np.eye(3))
+    around = boxes.bound([solid], np.eye(3))
     return float(around.size[0] * around.size[1])
 
 
@@ -404,12 +406,12 @@ def solid_of(model: mujoco.MjModel, geom: int) -> Solid:
     mat = mat.reshape(3, 3)
     kind = mujoco.mjtGeom(int(model.geom_type[geom]))
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return Solid(fits.BOX, pos, mat, size)
+        return Solid(shapes.BOX, pos, mat, size)
     if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE):
         half = size[1] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
-        return Solid(fits.CAPSULE, pos, mat, np.array([size[0], half, 0.0]))
+        return Solid(shapes.CAPSULE, pos, mat, np.array([size[0], half, 0.0]))
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return Solid(fits.CYLINDER, pos, mat, size)
+        return Solid(shapes.CYLINDER, pos, mat, size)
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         return _hull(model, geom, pos, mat)
     raise SceneError(f"geom {model.geom(geom).name!r} is a {kind.name}, which no fit knows")
@@ -421,4 +423,4 @@ def _hull(model: mujoco.MjModel, geom: int, pos: np.ndarray, mat: np.ndarray) ->
     local = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
     low, high = local.min(axis=0), local.max(axis=0)
     centre = pos + mat @ ((low + high) / 2)
-    return Solid(fits.HULL, centre, mat, (high - low) / 2, points=pos + local @ mat.T)
+    return Solid(shapes.HULL, centre, mat, (high - low) / 2, points=pos + local @ mat.T)

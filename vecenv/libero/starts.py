@@ -1,0 +1,147 @@
+"""Start states of episodes: stored or settled init states with the fixture poses that the options ask for.
+
+In: a task, its compiled scene, the options of the batch and which episodes are wanted. Out: a
+``vecenv.libero.physics.base.Start``, ready to be written into the physics. Also here, because it starts from the same
+states: how much contact memory MJX needs for a scene (``measured_budget``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vecenv.errors import InvalidInput
+from vecenv.libero.config import EpisodeRules, LiberoConfig
+from vecenv.libero.physics import budgets, settling
+from vecenv.libero.physics.base import Start
+from vecenv.libero.physics.budgets import Budget
+from vecenv.libero.scene import goals
+from vecenv.libero.scene.bddl import Problem, SceneKey
+from vecenv.libero.scene.scene import Scene
+from vecenv.libero.tasks import fixtures, settled
+from vecenv.libero.tasks.sources import Task
+from vecenv.libero.tasks.suites import NUM_EPISODES
+
+# Starts of a scene on which its memory on MJX is measured.
+BUDGET_STARTS = 64
+
+
+class StoredStartsError(InvalidInput):
+    """Stored starts that do not fit the compiled scene; the message says how they differ."""
+
+
+def start_of(
+    source: Task,
+    scene: Scene,
+    config: LiberoConfig,
+    rules: EpisodeRules,
+    episodes: np.ndarray,
+    slots: np.ndarray,
+    keys: Sequence[tuple[int, str, int, int]],
+) -> Start:
+    """Start states of n slots of one task.
+
+    Args:
+        source: the task.
+        scene: its compiled scene.
+        config: options; ``geometry`` and ``contacts`` are read.
+        rules: how episodes begin; ``start``, ``fixtures`` and ``reset_loop`` are read.
+        episodes: init state of each slot, int [n].
+        slots: indices of the slots in the batch, int [n]; fixture poses given per slot are looked up by them.
+        keys: (seed, suite, task, episode) of each slot, what sampled fixture poses depend on.
+
+    Raises:
+        StoredStartsError: the stored states do not fit the scene.
+        FixtureError, ResetError, SettlingError: the fixture poses cannot be had, or things do not come to rest.
+    """
+    problem = source.problem()
+    qpos, qvel = _stored(source, problem, rules)
+    nq, nv = scene.model.nq, scene.model.nv
+    if (qpos.shape[1], qvel.shape[1]) != (nq, nv):
+        raise StoredStartsError(
+            f"starts of {qpos.shape[1]} + {qvel.shape[1]} numbers, but the scene has {nq} positions and {nv} velocities"
+        )
+    bodies, pos, quat = fixtures.poses(
+        problem, scene, rules.fixtures, keys=keys, slots=slots.tolist(), loop=rules.reset_loop
+    )
+    shipped = _ships_settled(rules)
+    start = Start(
+        qpos=qpos[episodes],
+        qvel=qvel[episodes],
+        bodies=bodies,
+        body_pos=pos,
+        body_quat=quat,
+        time=settled.TIME if shipped else 0.0,
+        settled=shipped,
+    )
+    if shipped or rules.start == "raw":
+        return start
+    return settling.at_rest(_settling_scene(source, problem, scene, config), start)
+
+
+def _ships_settled(rules: EpisodeRules) -> bool:
+    """Whether settled starts come with the package: only with fixtures at the centres of their regions."""
+    return rules.start == "settled" and rules.fixtures == "center"
+
+
+def _stored(source: Task, problem: Problem, rules: EpisodeRules) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [50, nq] and velocities [50, nv] of a task's starts."""
+    if _ships_settled(rules):
+        starts = source.settled()
+        return starts.qpos, starts.qvel
+    states, free_joints = source.init_states(), len(problem.objects)
+    # Robot, hinges and slides have as many positions as velocities; a free joint has one position more.
+    nq = (states.shape[1] - 1 + free_joints) // 2
+    return states[:, 1 : 1 + nq], states[:, 1 + nq :]
+
+
+def _settling_scene(source: Task, problem: Problem, scene: Scene, config: LiberoConfig) -> Scene:
+    """The scene that starts settle in: upstream's geometry, published contacts."""
+    if config.geometry == "exact" and config.contacts == "published":
+        return scene
+    return source.scene(goals.contact_pairs([problem]))
+
+
+def sharing(sources: Sequence[Task], key: SceneKey) -> list[Task]:
+    """The tasks whose scene has this key."""
+    return [task for task in sources if task.problem().scene_key() == key]
+
+
+def measured_budget(scene: Scene, tasks: Sequence[Task]) -> Budget:
+    """Contact and constraint memory on MJX, measured on settled starts of all the tasks that share a scene."""
+    each = -(-BUDGET_STARTS // len(tasks))
+    episodes = np.linspace(0, NUM_EPISODES - 1, min(each, NUM_EPISODES)).astype(int)
+    return budgets.cached(scene, _joined([_central_start(task, scene, episodes) for task in tasks]))
+
+
+def _central_start(task: Task, scene: Scene, episodes: np.ndarray) -> Start:
+    """Settled starts of a task, fixtures at the centres of their regions."""
+    stored = task.settled()
+    bodies, pos, quat = fixtures.poses(
+        task.problem(), scene, "center", keys=[(0, "", 0, 0)] * len(episodes), slots=range(len(episodes))
+    )
+    return Start(
+        qpos=stored.qpos[episodes],
+        qvel=stored.qvel[episodes],
+        bodies=bodies,
+        body_pos=pos,
+        body_quat=quat,
+        settled=True,
+    )
+
+
+def _joined(starts: Sequence[Start]) -> Start:
+    """Settled starts of one scene, one after the other."""
+
+    def join(name: str) -> np.ndarray:
+        return np.concatenate([getattr(start, name) for start in starts])
+
+    return Start(
+        qpos=join("qpos"),
+        qvel=join("qvel"),
+        bodies=starts[0].bodies,
+        body_pos=join("body_pos"),
+        body_quat=join("body_quat"),
+        settled=True,
+    )
