@@ -18,7 +18,7 @@ import pytest
 from support.simpler_files import GOOGLE_ROLLOUTS, SEEDS, WIDOWX_ROLLOUTS, rollouts
 
 from vecenv.contract import ImagesUnavailable, State
-from vecenv.simpler.control.kinematics import rotation_from_quat
+from vecenv.simpler.control.rotations import rotation_from_quat
 from vecenv.simpler.layouts import episode_layout
 from vecenv.simpler.tasks import BRIDGE, GOOGLE, TASKS, find_task, list_tasks
 

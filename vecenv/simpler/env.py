@@ -25,9 +25,11 @@ from vecenv.contract import CameraView, Control, Egocentric, Objects, Rendered, 
 from vecenv.controllers.waypoint import Plan
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.config import SimplerConfig, SimplerError
-from vecenv.simpler.control import kinematics, robots
-from vecenv.simpler.control.kinematics import rotation_from_quat
+from vecenv.simpler.control import robots
+from vecenv.simpler.control.chain import Chain
+from vecenv.simpler.control.rotations import quat_from_rotation, rotation_from_quat
 from vecenv.simpler.control.servo import Servo, ServoConfig
+from vecenv.simpler.control.urdf import read_urdf
 from vecenv.simpler.episodes import Episode, prepare, require_drawable
 from vecenv.simpler.judge import Judge, Verdict
 from vecenv.simpler.physics.scenes import instances
@@ -80,7 +82,7 @@ class SimplerEnv(SlotBatch):
         # Where objects of an episode came to rest; settling is the dearest part of a reset.
         self._settled: dict[tuple[int, int], np.ndarray] = {}
         self._prepared: dict[tuple[int, int], Episode] = {}
-        self._chains: dict[str, kinematics.Chain] = {}
+        self._chains: dict[str, Chain] = {}
         self._place(placement)
 
     def _sizes(self) -> Sizes:
@@ -287,12 +289,12 @@ class SimplerEnv(SlotBatch):
         if link == self.robot.root:
             return facts["base"]
         if link not in self._chains:
-            urdf = kinematics.read_urdf(self._root / self.robot.urdf_path())
+            urdf = read_urdf(self._root / self.robot.urdf_path())
             self._chains[link] = urdf.chain(link, self.robot.joints)
         position, rotation = self._chains[link].pose(facts["qpos"])
         turn = rotation_from_quat(facts["base"][:, 3:])
         world = facts["base"][:, :3] + np.einsum("nij,nj->ni", turn, position)
-        return np.concatenate([world, kinematics.quat_from_rotation(turn @ rotation)], axis=1)
+        return np.concatenate([world, quat_from_rotation(turn @ rotation)], axis=1)
 
     def observe_objects(self, points: str = "surface") -> Objects:
         """Ground truth of every slot.

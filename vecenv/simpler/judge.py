@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.simpler.control.kinematics import rotation_from_quat
+from vecenv.simpler.control.rotations import rotation_from_quat
 from vecenv.simpler.tasks import DrawerSuccess, MoveNearSuccess, PickSuccess, PlaceSuccess, PutOnSuccess, SimplerTask
 
 # Steps in a row that make a grasp a firm one.

@@ -23,14 +23,14 @@ import numpy as np
 
 from vecenv.controllers.interpolate import Limits, Planner
 from vecenv.errors import InvalidInput
-from vecenv.simpler.control.kinematics import (
-    Chain,
+from vecenv.simpler.control.chain import Chain
+from vecenv.simpler.control.rotations import (
     quat_from_rotation,
-    read_urdf,
     rotation_from_quat,
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
+from vecenv.simpler.control.urdf import read_urdf
 
 _DESCRIPTIONS = PurePosixPath("mani_skill2_real2sim/assets/descriptions")
 ACTION_DIM = 7
