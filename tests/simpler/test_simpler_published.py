@@ -21,7 +21,8 @@ from typer.testing import CliRunner
 
 from vecenv.assets import AssetsMissing
 from vecenv.placement import PlacementError
-from vecenv.simpler.assets.files import VARIANTS_MANIFEST, assets_app, how_to_get, read_manifest
+from vecenv.simpler.assets.files import VARIANTS_MANIFEST, how_to_get, read_manifest
+from vecenv.simpler.cli import assets_app
 from vecenv.simpler.layouts import LayoutError, episode_layout, episode_seed, lay_out
 from vecenv.simpler.published import lists as published
 from vecenv.simpler.published.lists import (

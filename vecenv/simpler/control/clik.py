@@ -116,7 +116,7 @@ def _follow(
         x, y, z = axis[j, 0], axis[j, 1], axis[j, 2]
         for row in range(3):
             axes[j, row] = frame[row, 0] * x + frame[row, 1] * y + frame[row, 2] * z
-        value = q[columns[j]]
+        value = float(q[columns[j]])
         if slides[j]:
             for row in range(3):
                 frame[3, row] += value * axes[j, row]
