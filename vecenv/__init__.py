@@ -190,9 +190,9 @@ def family(suite: str) -> str:
 
 def _simpler_metadata(suite: str, protocol: Protocol) -> dict[str, Any]:
     """SIMPLER's metadata with the episodes that a protocol has of each task; 0 of those that it leaves out."""
-    from vecenv.simpler import tasks as simpler_tasks
+    from vecenv.simpler.published.metadata import eval_metadata
 
-    metadata = simpler_tasks.eval_metadata(suite)
+    metadata = eval_metadata(suite)
     if protocol.episodes is not None:
         return metadata
     from vecenv.simpler.published import lists as published
@@ -226,7 +226,7 @@ def list_tasks(suite: str) -> tuple[Any, ...]:
     """The tasks of a suite in upstream's order, each with an ``index``, a ``name`` and an ``instruction``.
 
     Returns:
-        ``vecenv.libero.tasks.suites.TaskSpec`` or ``vecenv.simpler.tasks.SimplerTask``, by the suite.
+        ``vecenv.libero.tasks.suites.TaskSpec`` or ``vecenv.simpler.task_spec.SimplerTask``, by the suite.
 
     Raises:
         KeyError: a subclass that lists the suites there are.

@@ -27,7 +27,8 @@ from vecenv.simpler.assets.errors import FileNotInSource
 from vecenv.simpler.assets.files import Entry, Manifest, ManifestError, read_manifest, resolve, visual_mesh
 from vecenv.simpler.assets.pull import Archive, PullError, Report
 from vecenv.simpler.cli import assets_app
-from vecenv.simpler.tasks import TASKS, model_folder
+from vecenv.simpler.models import model_folder
+from vecenv.simpler.tasks import TASKS
 
 QUICK = RetryPolicy(attempts=3, connect=1.0, read=0.3, wait=0.0)
 ONCE = RetryPolicy(attempts=1, connect=1.0, read=0.3, wait=0.0)

@@ -20,15 +20,17 @@ from support.simpler_files import GOOGLE_ROLLOUTS, SEEDS, WIDOWX_ROLLOUTS, rollo
 from vecenv.contract import ImagesUnavailable, State
 from vecenv.simpler.control.rotations import rotation_from_quat
 from vecenv.simpler.layouts import episode_layout
-from vecenv.simpler.tasks import BRIDGE, GOOGLE, TASKS, find_task, list_tasks
+from vecenv.simpler.task_spec import BRIDGE, GOOGLE
+from vecenv.simpler.tasks import TASKS, find_task, list_tasks
 
 pytest.importorskip("sapien")
 pytest.importorskip("ruckig")
 
 from vecenv.simpler import episodes as preparing
 from vecenv.simpler import judge as judging
+from vecenv.simpler import workers
 from vecenv.simpler.env import SimplerEnv, SimplerError, make
-from vecenv.simpler.physics import hulls, scenes, workers
+from vecenv.simpler.physics import hulls, scenes, spec
 
 CARROT, OPEN_TOP, COKE = "widowx_carrot_on_plate", "google_robot_open_top_drawer", "google_robot_pick_coke_can"
 PLACE = "google_robot_place_apple_in_closed_top_drawer"
@@ -391,7 +393,7 @@ def test_google_robot_opens_and_closes(tree: Path, gripper: str, opening: float,
     fingers = env.observe_egocentric().state[:, 7:9]
     np.testing.assert_allclose(fingers[0], 0.0, atol=2e-3)
     # Closed fingers stop at each other.
-    np.testing.assert_allclose(fingers[1], scenes.GOOGLE_FINGER_STOP / 2, atol=5e-3)
+    np.testing.assert_allclose(fingers[1], spec.GOOGLE_FINGER_STOP / 2, atol=5e-3)
     env.close()
 
 
@@ -564,7 +566,7 @@ def test_the_second_half_begins_by_itself(small: Path) -> None:
 
 def test_a_lifted_object_counts_until_the_grasp_is_lost() -> None:
     task = find_task(GOOGLE, COKE)
-    rows = np.zeros(1, scenes.facts_dtype(11, 1))
+    rows = np.zeros(1, spec.facts_dtype(11, 1))
     rows["objects"][0, 0, 3] = 1.0
     roles = judging.Roles(source=0, loose=(0,), sizes=np.ones((1, 3)))
     judge = judging.Judge(task, roles, rows[0])
@@ -590,7 +592,7 @@ def replay(root: Path, name: str, seed: int) -> tuple[scenes.Scene, np.ndarray, 
     episode = preparing.prepare(task, episode_layout(task, seed), root)
     scene = scenes.Scene(episode.spec)
     scene.begin(episode.start)
-    rows = np.zeros(1, scenes.facts_dtype(task.robot.dof, len(episode.spec.objects)))
+    rows = np.zeros(1, spec.facts_dtype(task.robot.dof, len(episode.spec.objects)))
     scene.measure(rows[0])
     control = robots.controller(task.robot, root / task.robot.urdf_path(), 1)
     control.reset(np.ones(1, bool), rows["qpos"])

@@ -24,6 +24,7 @@ from vecenv.placement import PlacementError
 from vecenv.simpler.assets.files import VARIANTS_MANIFEST, how_to_get, read_manifest
 from vecenv.simpler.cli import assets_app
 from vecenv.simpler.layouts import LayoutError, episode_layout, episode_seed, lay_out
+from vecenv.simpler.models import model_folder
 from vecenv.simpler.published import lists as published
 from vecenv.simpler.published.lists import (
     PROTOCOLS,
@@ -34,7 +35,9 @@ from vecenv.simpler.published.lists import (
     place,
     scene_of,
 )
-from vecenv.simpler.tasks import BRIDGE, DATA, GOOGLE, TASKS, UnknownTask, eval_metadata, model_folder
+from vecenv.simpler.published.metadata import eval_metadata
+from vecenv.simpler.task_spec import BRIDGE, DATA, GOOGLE
+from vecenv.simpler.tasks import TASKS, UnknownTask
 
 if TYPE_CHECKING:
     from vecenv.simpler.env import SimplerEnv

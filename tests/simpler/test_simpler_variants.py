@@ -13,7 +13,8 @@ from support import simpler_assets_small
 import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.simpler.layouts import episode_layout, episode_seed
-from vecenv.simpler.tasks import TASKS, Lighting
+from vecenv.simpler.task_spec import Lighting
+from vecenv.simpler.tasks import TASKS
 from vecenv.simpler.variants import DISTRACTORS, STATIONS, Variant, VariantError, varied
 
 COKE, NEAR, OPEN = "google_robot_pick_coke_can", "google_robot_move_near", "google_robot_open_top_drawer"

@@ -32,12 +32,12 @@ from vecenv.simpler.control.servo import Servo, ServoConfig
 from vecenv.simpler.control.urdf import read_urdf
 from vecenv.simpler.episodes import Episode, prepare, require_drawable
 from vecenv.simpler.judge import Judge, Verdict
-from vecenv.simpler.physics.scenes import instances
-from vecenv.simpler.physics.workers import Job, Sizes, Slots, make_slots
+from vecenv.simpler.physics.spec import instances
 from vecenv.simpler.published.lists import SEED, EpisodeSpec, check_placement, counts, place, scene_of
 from vecenv.simpler.published.lists import episodes as published_episodes
 from vecenv.simpler.tasks import find_task, list_tasks
 from vecenv.simpler.variants import make_variant, varied
+from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
 if TYPE_CHECKING:

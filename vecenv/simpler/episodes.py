@@ -17,20 +17,21 @@ from vecenv.simpler.assets import files as assets
 from vecenv.simpler.control.robots import GOOGLE_ROBOT, LinkMaterial, Robot
 from vecenv.simpler.judge import Roles
 from vecenv.simpler.layouts import Layout, Placed
-from vecenv.simpler.physics.scenes import (
+from vecenv.simpler.models import ModelInfo, read_models
+from vecenv.simpler.physics.spec import (
     GOOGLE_FINGER_ARMATURE,
     GOOGLE_FINGER_STOP,
     Box,
-    Cabinet,
-    Finger,
+    CabinetBody,
+    FingerLink,
+    LinkSurface,
     ObjectBody,
     RobotBody,
     SceneSpec,
-    Stage,
+    StageBody,
     Start,
 )
-from vecenv.simpler.physics.weld import LinkSurface
-from vecenv.simpler.tasks import BRIDGE, DRAWERS, ModelInfo, SimplerTask, read_models
+from vecenv.simpler.task_spec import BRIDGE, DRAWERS, SimplerTask
 from vecenv.simpler.variants import station_meshes
 
 # The cabinet's place in the world.
@@ -85,7 +86,7 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
         contact_offset=task.contact_offset,
         objects=tuple(_body(placed, models, root, notes) for placed in layout.objects),
         stage=_stage(task, root, notes),
-        cabinet=Cabinet(urdf=root / task.station, drawers=DRAWERS, pose=CABINET_POSE) if task.station else None,
+        cabinet=CabinetBody(urdf=root / task.station, drawers=DRAWERS, pose=CABINET_POSE) if task.station else None,
     )
     roles = _roles(layout, models)
     return Episode(
@@ -100,7 +101,7 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
 
 
 def robot_body(robot: Robot, urdf: Path, qpos: Sequence[float] | None = None) -> RobotBody:
-    """A robot as physics sees it, with the remedies for PhysX 5 (``scenes.py``).
+    """A robot as physics sees it, with the remedies for PhysX 5 (``physics/spec.py``).
 
     Joints that nothing moves stay frozen where ``qpos`` [N] has them; without it they are left free.
     """
@@ -119,7 +120,7 @@ def robot_body(robot: Robot, urdf: Path, qpos: Sequence[float] | None = None) ->
         ignored=tuple((link, _shared_bits(link, pairs)) for link in touching),
         tcp=robot.tool,
         fingers=tuple(
-            Finger(link=link, side=side, opening=finger.opening)
+            FingerLink(link=link, side=side, opening=finger.opening)
             for side, finger in enumerate(robot.fingers)
             for link in finger.links
         ),
@@ -152,27 +153,27 @@ def _body(placed: Placed, models: dict[str, ModelInfo], root: Path, notes: list[
     )
 
 
-def _stage(task: SimplerTask, root: Path, notes: list[str]) -> Stage | None:
+def _stage(task: SimplerTask, root: Path, notes: list[str]) -> StageBody | None:
     """The surroundings that things can touch."""
     if task.stage.mesh is None or not task.stage.solid:
         return None
     found = assets.resolve(task.stage.mesh, root)
     if found.path is not None:
-        return Stage(mesh=found.path, mesh_pose=task.stage.turn, offset=task.stage.offset)
+        return StageBody(mesh=found.path, mesh_pose=task.stage.turn, offset=task.stage.offset)
     assert found.stand_in is not None  # ``resolve`` gives one or the other
     notes.append(found.note)
     low, high = _TABLETOPS.get(task.suite, _COKE_TABLETOP)
     centre = (*((a + b) / 2 for a, b in zip(low, high, strict=True)), found.stand_in.top - _THICKNESS / 2)
     half = (*((b - a) / 2 for a, b in zip(low, high, strict=True)), _THICKNESS / 2)
-    return Stage(boxes=(Box(centre=_three(centre), half_size=_three(half)),))
+    return StageBody(boxes=(Box(centre=_three(centre), half_size=_three(half)),))
 
 
-def drawn_stage(episode: Episode, root: Path) -> Stage | None:
+def drawn_stage(episode: Episode, root: Path) -> StageBody | None:
     """The surroundings as they are drawn: rooms around cabinets can be seen but not touched."""
     stage = episode.task.stage
     if stage.solid or stage.mesh is None:
         return episode.spec.stage
-    return Stage(mesh=root / stage.mesh, mesh_pose=stage.turn, offset=stage.offset, solid=False)
+    return StageBody(mesh=root / stage.mesh, mesh_pose=stage.turn, offset=stage.offset, solid=False)
 
 
 def _undrawn(task: SimplerTask, root: Path) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """What an episode of SIMPLER consists of: which objects, where they are dropped, where the robot stands, what is said.
 
 In: a task and its ``Choices``: the robot's place, the object's, the drawer, the arrangement. They are drawn from a seed
-(``drawn``) or come from a published list (``published.py``). Out: a ``Layout`` (``lay_out``). Draws are made by NumPy's
+(``drawn``) or come from a published list (``published/lists.py``). Out: a ``Layout`` (``lay_out``). Draws are made by NumPy's
 ``RandomState`` alone, draw for draw as upstream does it (ManiSkill2_real2sim commit ef7a4d4, ``envs/custom_scenes``).
 Each class of upstream's hierarchy starts the episode's stream anew, so draws of different layers are made from equal
 streams: that is why several functions begin with a fresh ``RandomState(seed)``. Objects are given where they are
@@ -21,7 +21,8 @@ from typing import Any, TypedDict
 import numpy as np
 
 from vecenv.errors import InvalidInput
-from vecenv.simpler.tasks import DRAWERS, FIRST_SEED, NUM_EPISODES, ORIENTATIONS, SimplerTask
+from vecenv.simpler.task_spec import DRAWERS, ORIENTATIONS, SimplerTask
+from vecenv.simpler.tasks import FIRST_SEED, NUM_EPISODES
 
 Vector = tuple[float, float, float]
 Quat = tuple[float, float, float, float]

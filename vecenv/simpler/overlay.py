@@ -26,8 +26,9 @@ from PIL import Image
 
 from vecenv.errors import SimulationError
 from vecenv.simpler.episodes import Episode, drawn_stage, require_drawable
-from vecenv.simpler.physics.scenes import CABINET, ROBOT, Scene, SceneSpec, instances
-from vecenv.simpler.tasks import Camera, Lighting
+from vecenv.simpler.physics.scenes import Scene
+from vecenv.simpler.physics.spec import CABINET, ROBOT, SceneSpec, instances
+from vecenv.simpler.task_spec import Camera, Lighting
 
 # What upstream gives robots and, in one task, objects.
 _SHINY = {"specular": 0.9, "roughness": 0.3}
@@ -47,7 +48,7 @@ class Pictures(NamedTuple):
 
     Attributes:
         rgb: colours, uint8 [..., H, W, 3].
-        segmentation: index into ``scenes.instances`` of the episode's scene, int16 [..., H, W]; 0 is everything that
+        segmentation: index into ``physics.spec.instances`` of the episode's scene, int16 [..., H, W]; 0 is everything that
             the photograph replaces.
         depth: distance from the camera's plane, metres, float32 [..., H, W]; of the drawn scene, the photograph has
             none. None where it was not asked for.

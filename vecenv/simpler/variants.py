@@ -4,7 +4,7 @@ In: a ``Variant`` and an episode's task and layout. Out: both, changed (``varied
 variant aggregation (SimplerEnv commit 4ab7178, ``scripts/*_variant_agg.sh``; ManiSkill2_real2sim commit ef7a4d4). With
 ``make(variant=...)`` they are put on episodes that seeds decide, where ``overlay="none"`` belongs to most of them;
 upstream's own episodes, on grids of robot and object positions, are ``make(protocol="variant-aggregation")``
-(``published.py``).
+(``published/lists.py``).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vecenv.assets import AssetsMissing
 from vecenv.errors import InvalidInput
 from vecenv.simpler.assets.files import NAME, how_to_get
 from vecenv.simpler.layouts import Layout, Placed
-from vecenv.simpler.tasks import DATA, DirectionalLight, Lighting, SimplerTask, Stage
+from vecenv.simpler.task_spec import DATA, DirectionalLight, Lighting, SimplerTask, StageSpec
 
 _ON_TABLE, _AT_CABINET = ("pick", "move_near"), ("open", "close", "place")
 _GOOGLE_FAMILIES = (*_ON_TABLE, *_AT_CABINET)
@@ -157,7 +157,7 @@ def _task_changes(task: SimplerTask, variant: Variant) -> dict[str, Any]:
         changes["station"] = DATA / f"custom/{name}.urdf"
     if variant.stage is not None:
         name = _chosen(task, "stage", variant.stage, {} if cabinet else {each: each for each in STAGES})
-        changes["stage"] = Stage(name=name, offset=task.stage.offset, table_height=task.stage.table_height)
+        changes["stage"] = StageSpec(name=name, offset=task.stage.offset, table_height=task.stage.table_height)
     return changes
 
 

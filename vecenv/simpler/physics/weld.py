@@ -21,23 +21,12 @@ import sapien
 from sapien import physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
 
+from vecenv.simpler.physics.spec import LinkSurface
+
 # Shapes with the same id (word 3 of a collision group) that share an "ignore" bit (word 2) never collide.
 IGNORE_ID = 1
 # The bit for a robot's root and what it stands on; others are free.
 ROOT_BIT = 1 << 15
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinkSurface:
-    """What the collision shapes of a link are made of.
-
-    Attributes:
-        friction: static and dynamic friction.
-        patch_radius: metres; what torsional friction is computed from.
-    """
-
-    friction: tuple[float, float] = (1.0, 1.0)
-    patch_radius: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -53,17 +53,9 @@ from vecenv.simpler.published.specs import (
     common_fields,
 )
 from vecenv.simpler.published.sweeps import AGGREGATION, MATCHING
-from vecenv.simpler.tasks import (
-    COKE_TABLE,
-    NUM_EPISODES,
-    PLAIN_MODELS_FILE,
-    PLAIN_TRIPLETS,
-    TASKS,
-    SimplerTask,
-    Stage,
-    UnknownTask,
-    list_tasks,
-)
+from vecenv.simpler.task_spec import SimplerTask, StageSpec
+from vecenv.simpler.task_table import COKE_TABLE, PLAIN_MODELS_FILE, PLAIN_TRIPLETS
+from vecenv.simpler.tasks import NUM_EPISODES, TASKS, UnknownTask, list_tasks
 from vecenv.simpler.variants import varied
 
 __all__ = [
@@ -235,12 +227,12 @@ def _of_choices(task: SimplerTask, protocol: str, source: str, choices: Choices)
 _GOOGLE_OFFSET = COKE_TABLE.offset
 
 
-def _room(name: str, turn: tuple[float, ...] = COKE_TABLE.turn) -> Stage:
-    return Stage(name=name, offset=_GOOGLE_OFFSET, turn=turn, solid=False)
+def _room(name: str, turn: tuple[float, ...] = COKE_TABLE.turn) -> StageSpec:
+    return StageSpec(name=name, offset=_GOOGLE_OFFSET, turn=turn, solid=False)
 
 
 # Upstream turns and shifts two of them: a pose times the quaternion (0.707, 0.707, 0, 0), which puts a mesh upright.
-ROOMS: Mapping[str, Stage] = MappingProxyType(
+ROOMS: Mapping[str, StageSpec] = MappingProxyType(
     {
         "frl_apartment_stage_simple": _room("frl_apartment_stage_simple"),
         "modern_bedroom_no_roof": _room(

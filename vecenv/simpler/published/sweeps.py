@@ -1,7 +1,7 @@
 """The sweeps of upstream's scripts, loop by loop: the episodes of visual matching and of variant aggregation.
 
 In: a task. Out: its ``EpisodeSpec``s in the order in which the scripts (SimplerEnv commit 4ab7178, ``scripts/``) run
-them for one checkpoint; numbers are given by ``published.py``.
+them for one checkpoint; ``lists.py`` numbers them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vecenv.simpler.published.specs import (
     EpisodeSpec,
     common_fields,
 )
-from vecenv.simpler.tasks import SimplerTask
+from vecenv.simpler.task_spec import SimplerTask
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Grids.

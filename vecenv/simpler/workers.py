@@ -1,7 +1,7 @@
 """Many slots: scenes side by side in this process, or spread over worker processes.
 
 In: which scene and start a slot gets, and set-points of all slots, [B, substeps, dof]. Out: ``facts``, one row of
-``scenes.facts_dtype`` a slot, and ``faults``; and pictures. A PhysX step in SAPIEN holds Python's lock, so threads
+``physics.spec.facts_dtype`` a slot, and ``faults``; and pictures. A PhysX step in SAPIEN holds Python's lock, so threads
 would not help: several processes are what uses several cores. Set-points and facts lie in memory that all of them
 share; what is sent is a few bytes a tick. Pictures are drawn where their slots are, into memory that is made for them.
 Workers are started as a module, so the caller's script is not imported again.
@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 
 from vecenv.errors import SimulationError
-from vecenv.simpler.physics.scenes import Scene, SceneSpec, Start, facts_dtype
+from vecenv.simpler.physics.scenes import Scene
+from vecenv.simpler.physics.spec import SceneSpec, Start, facts_dtype
 
 if TYPE_CHECKING:
     from vecenv.simpler.overlay import Canvas, Painter, Pictures, Style, Subject
@@ -291,7 +292,7 @@ class _Worker:
         mine, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "vecenv.simpler.physics.workers", str(theirs.fileno()), str(memory)],
+                [sys.executable, "-m", "vecenv.simpler.workers", str(theirs.fileno()), str(memory)],
                 pass_fds=(theirs.fileno(), memory),
                 env=environment,
             )
