@@ -12,26 +12,27 @@ An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
-from vecenv.contract import CameraView, Control, Egocentric, Objects, Rendered, State
+from vecenv.contract import Control, Egocentric, Objects, Rendered, State
 from vecenv.controllers.waypoint import Plan
+from vecenv.simpler import snapshot
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.config import SimplerConfig, SimplerError
 from vecenv.simpler.control import robots
-from vecenv.simpler.control.chain import Chain
-from vecenv.simpler.control.rotations import quat_from_rotation, rotation_from_quat
 from vecenv.simpler.control.servo import Servo, ServoConfig
-from vecenv.simpler.control.urdf import read_urdf
 from vecenv.simpler.episodes import Episode, prepare, require_drawable
+from vecenv.simpler.following import PlanFollower
 from vecenv.simpler.judge import Judge, Verdict
+from vecenv.simpler.observe import CameraPoses, LazyImages, SimplerEgocentric, SlotFacts
+from vecenv.simpler.overlay import ImageBuffer, Images, RenderStyle, RenderSubject
 from vecenv.simpler.physics.spec import instances
 from vecenv.simpler.published.lists import SEED, EpisodeSpec, check_placement, counts, place, scene_of
 from vecenv.simpler.published.lists import episodes as published_episodes
@@ -40,11 +41,6 @@ from vecenv.simpler.variants import make_variant, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
-if TYPE_CHECKING:
-    from vecenv.simpler.overlay import Pictures
-
-# Slot -> its episode and a row of facts.
-_Shown: TypeAlias = dict[int, tuple[Episode, np.void]]
 # Largest action: metres, radians, gripper.
 ACTION_LIMITS = np.array([1.0, 1.0, 1.0, np.pi / 2, np.pi / 2, np.pi / 2, 1.0])
 # LIBERO's name for the third-person camera.
@@ -79,10 +75,10 @@ class SimplerEnv(SlotBatch):
         self._controller = robots.controller(self.robot, self._root / self.robot.urdf_path(), self.num_envs)
         self._servo = Servo(self._controller, config.servo or ServoConfig.of(self.robot))
         self._slots: Slots | None = make_slots(self._sizes(), self._num_workers())
-        # Where objects of an episode came to rest; settling is the dearest part of a reset.
+        # Where objects of an episode came to rest; settling is the most expensive part of a reset.
         self._settled: dict[tuple[int, int], np.ndarray] = {}
         self._prepared: dict[tuple[int, int], Episode] = {}
-        self._chains: dict[str, Chain] = {}
+        self._camera_poses = CameraPoses(self.robot, self._root)
         self._place(placement)
 
     def _sizes(self) -> Sizes:
@@ -239,8 +235,9 @@ class SimplerEnv(SlotBatch):
         return reward, arrived
 
     def _follow(self, plan: Plan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        followed = _Followed(self, plan, max_misses)
-        return followed.run(), followed.converged, followed.ticks
+        follower = PlanFollower(self._servo, plan, max_misses)
+        reward = follower.run(self._tick, lambda: self._facts, lambda: self._done)
+        return reward, follower.converged, follower.ticks
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
@@ -254,47 +251,23 @@ class SimplerEnv(SlotBatch):
         facts = self._facts.copy()
         state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
         healthy = [slot for slot, fault in enumerate(self._fault) if not fault]
-        seen = _Seen(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
+        images = LazyImages(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
+        cameras = [episode.task.camera for episode in self._episodes]
         return SimplerEgocentric(
             state=state.astype(np.float32),
-            images=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("rgb")}),
-            depths=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("depth")}),
-            segmentations=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("segmentation")}),
-            views={_CAMERA: self._view(facts)},
+            images=Rendered([_CAMERA], lambda _: {_CAMERA: images.read("rgb")}),
+            depths=Rendered([_CAMERA], lambda _: {_CAMERA: images.read("depth")}),
+            segmentations=Rendered([_CAMERA], lambda _: {_CAMERA: images.read("segmentation")}),
+            views={_CAMERA: self._camera_poses.view(cameras, facts)},
             instances=tuple(instances(episode.spec) for episode in self._episodes),
         )
 
-    def _draw(self, shown: _Shown, deep: bool) -> Pictures:
-        from vecenv.simpler.overlay import Canvas, Style, Subject
-
+    def _draw(self, slots: SlotFacts, deep: bool) -> Images:
         camera = self._episodes[0].task.camera
-        style = Style(overlay=self.config.overlay, shadows=self.config.shadows)
-        canvas = Canvas(slots=self.num_envs, height=camera.height, width=camera.width, deep=deep)
-        orders = {slot: (Subject.of(episode, self._root), facts) for slot, (episode, facts) in shown.items()}
-        return self.slots.draw(style, canvas, orders)
-
-    def _view(self, facts: np.ndarray) -> CameraView:
-        cameras = [episode.task.camera for episode in self._episodes]
-        mounts = {camera.link: self._mounts(camera.link, facts) for camera in cameras}
-        mount = np.stack([mounts[camera.link][slot] for slot, camera in enumerate(cameras)])
-        local = rotation_from_quat(np.array([camera.quat for camera in cameras]))
-        turn = rotation_from_quat(mount[:, 3:])
-        position = mount[:, :3] + np.einsum("nij,nj->ni", turn, np.array([camera.position for camera in cameras]))
-        # SAPIEN's cameras look along x with z up; columns here are right, down and forward.
-        mat = (turn @ local) @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-        return CameraView(intrinsics=np.stack([camera.intrinsics for camera in cameras]), pos=position, mat=mat)
-
-    def _mounts(self, link: str, facts: np.ndarray) -> np.ndarray:
-        """World poses of a link, [B, 7]."""
-        if link == self.robot.root:
-            return facts["base"]
-        if link not in self._chains:
-            urdf = read_urdf(self._root / self.robot.urdf_path())
-            self._chains[link] = urdf.chain(link, self.robot.joints)
-        position, rotation = self._chains[link].pose(facts["qpos"])
-        turn = rotation_from_quat(facts["base"][:, 3:])
-        world = facts["base"][:, :3] + np.einsum("nij,nj->ni", turn, position)
-        return np.concatenate([world, quat_from_rotation(turn @ rotation)], axis=1)
+        style = RenderStyle(overlay=self.config.overlay, shadows=self.config.shadows)
+        buffer = ImageBuffer(slots=self.num_envs, height=camera.height, width=camera.width, deep=deep)
+        subjects = {slot: (RenderSubject.of(episode, self._root), facts) for slot, (episode, facts) in slots.items()}
+        return self.slots.draw(style, buffer, subjects)
 
     def observe_objects(self, points: str = "surface") -> Objects:
         """Ground truth of every slot.
@@ -305,8 +278,6 @@ class SimplerEnv(SlotBatch):
         Raises:
             SimplerError: another value.
         """
-        from vecenv.simpler import snapshot
-
         self._check_live()
         if points not in ("surface", "aabb"):
             raise SimplerError(f"points={points!r}: expected 'surface' or 'aabb'")
@@ -386,86 +357,6 @@ class SimplerEnv(SlotBatch):
         poses, speeds = qpos[joints : joints + 7 * count], qvel[joints : joints + 6 * count]
         things = np.concatenate([poses.reshape(-1, 7), speeds.reshape(-1, 6)], axis=1)
         return np.concatenate([qpos[:dof], qvel[:dof], qpos[dof:joints], qvel[dof:joints], things.ravel()])
-
-
-@dataclass(frozen=True)
-class SimplerEgocentric(Egocentric):
-    """An observation with the third-person camera only."""
-
-    @property
-    def wrist_image(self) -> None:  # type: ignore[override]
-        """Always None: there is no wrist camera."""
-        return None
-
-    @property
-    def observation(self) -> list[np.ndarray]:
-        """The third-person camera's image alone."""
-        return [self.rgb]
-
-
-class _Seen:
-    """Pictures of all slots at one moment, drawn when the first of them is asked for; again when depth is missing."""
-
-    def __init__(self, draw: Callable[[_Shown, bool], Pictures], shown: _Shown) -> None:
-        self._draw, self._shown = draw, shown
-        self._pictures: Pictures | None = None
-
-    def of(self, field: str) -> np.ndarray:
-        """One field of the pictures; zeros where nothing was drawn."""
-        if self._pictures is None or getattr(self._pictures, field) is None:
-            self._pictures = self._draw(self._shown, field == "depth")
-        return getattr(self._pictures, field)
-
-
-class _Followed:
-    """A plan being followed: every slot is at its own waypoint."""
-
-    def __init__(self, env: SimplerEnv, plan: Any, max_misses: int | None) -> None:
-        self._env, self._max_misses = env, max_misses
-        self._targets = np.concatenate([plan.pose.pos, plan.pose.quat, np.asarray(plan.grip)[..., None]], axis=-1)
-        self._hold, self._valid = np.asarray(plan.hold), np.asarray(plan.valid)
-        self.converged = np.zeros(self._valid.shape, bool)
-        self.ticks = np.zeros(self._valid.shape, int)
-        b = len(self._valid)
-        self._at, self._misses = np.zeros(b, int), np.zeros(b, int)
-        self._rows = np.arange(b)
-
-    def run(self) -> np.ndarray:
-        """Follow it to the end; returns the rewards [B]."""
-        env, length = self._env, self._valid.shape[1]
-        servo, reward = env._servo, np.zeros(env.num_envs)
-        servo.begin(env._facts["tcp"])
-        self._skip()
-        while (going := (self._at < length) & ~env._done & self._patient()).any():
-            here = np.minimum(self._at, length - 1)
-            targets, driving = self._targets[self._rows, here], self._hold[self._rows, here] == 0
-            reward += env._tick(servo.actions(targets, driving & going, env._facts), going)
-            self.ticks[self._rows[going], here[going]] += 1
-            self._leave(going, here, targets, driving)
-        return reward
-
-    def _patient(self) -> np.ndarray:
-        return self._misses < self._max_misses if self._max_misses is not None else np.ones(len(self._at), bool)
-
-    def _leave(self, going: np.ndarray, here: np.ndarray, targets: np.ndarray, driving: np.ndarray) -> None:
-        env, rows = self._env, self._rows
-        arrived = env._servo.arrived(targets, env._facts["tcp"])
-        limit = np.where(driving, env._servo.config.max_steps, self._hold[rows, here])
-        stuck = env._servo.stuck(targets, env._facts["tcp"], driving & going)
-        spent = stuck | (self.ticks[rows, here] >= limit)
-        leaving = going & ((driving & arrived) | spent)
-        self.converged[rows[leaving], here[leaving]] = arrived[leaving]
-        missed = leaving & driving & ~arrived
-        self._misses = np.where(missed, self._misses + 1, np.where(leaving & driving, 0, self._misses))
-        self._at += leaving
-        self._skip()
-
-    def _skip(self) -> None:
-        """Go past waypoints that are not valid."""
-        length = self._valid.shape[1]
-        for row in self._rows:
-            while self._at[row] < length and not self._valid[row, self._at[row]]:
-                self._at[row] += 1
 
 
 def task_indices(suite: str, tasks: Any) -> Any:

@@ -2,7 +2,7 @@
 
 In: what there is to see of an episode, and a row of facts. Out, in arrays of the caller: colours as policies see them,
 depth, and what each pixel shows.
-A ``Painter`` keeps *twins*: scenes with everything that is drawn, which are never stepped but posed like the slot they
+A ``Renderer`` keeps *twins*: scenes with everything that is drawn, which are never stepped but posed like the slot they
 are to show. So physics itself needs no renderer, and slots that look alike share one twin. Drawing needs a Vulkan
 driver: a GPU's, or Mesa's lavapipe on a CPU (Mesa 24.3 or later).
 
@@ -36,14 +36,14 @@ _MATTE = {"specular": 0.0, "roughness": 1.0, "metallic": 0.0}
 _SHADOW_EXTENT, _SHADOW_PIXELS = 5.0, 2048
 _FLOOR_HALF = [10.0, 10.0, 0.017]
 # Twins kept; each holds a scene's meshes and textures.
-_TWINS = 12
+_MAX_SCENES = 12
 
 
 class RendererMissing(SimulationError):
     """There is no usable Vulkan driver; the message says what to install."""
 
 
-class Pictures(NamedTuple):
+class Images(NamedTuple):
     """What cameras see; arrays to be filled or that were.
 
     Attributes:
@@ -58,14 +58,14 @@ class Pictures(NamedTuple):
     segmentation: np.ndarray
     depth: np.ndarray | None
 
-    def of(self, slot: int) -> Pictures:
+    def of(self, slot: int) -> Images:
         """Those of one slot, views."""
         depth = None if self.depth is None else self.depth[slot]
-        return Pictures(self.rgb[slot], self.segmentation[slot], depth)
+        return Images(self.rgb[slot], self.segmentation[slot], depth)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Canvas:
+class ImageBuffer:
     """Room for pictures of B slots, with depth if ``deep``."""
 
     slots: int
@@ -78,11 +78,11 @@ class Canvas:
         """That it takes."""
         return self.slots * self.height * self.width * (9 if self.deep else 5)
 
-    def pictures(self, memory: Any) -> Pictures:
+    def images(self, memory: Any) -> Images:
         """Arrays with B rows over a buffer."""
         shape, count = (self.slots, self.height, self.width), self.slots * self.height * self.width
         begin = 4 * count if self.deep else 0
-        return Pictures(
+        return Images(
             depth=np.frombuffer(memory, np.float32, count).reshape(shape) if self.deep else None,
             segmentation=np.frombuffer(memory, np.int16, count, begin).reshape(shape),
             rgb=np.frombuffer(memory, np.uint8, 3 * count, begin + 2 * count).reshape(*shape, 3),
@@ -135,7 +135,7 @@ MINIMAL, DEFAULT = _Minimal(), _Default()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Style:
+class RenderStyle:
     """How episodes are drawn.
 
     Attributes:
@@ -150,7 +150,7 @@ class Style:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
+class RenderSubject:
     """What is to be seen of an episode.
 
     Attributes:
@@ -170,7 +170,7 @@ class Subject:
     photo: Path | None
 
     @classmethod
-    def of(cls, episode: Episode, root: Path) -> Subject:
+    def of(cls, episode: Episode, root: Path) -> RenderSubject:
         """Of an episode; ``root`` is that of the asset tree.
 
         Raises:
@@ -190,14 +190,14 @@ class Subject:
         )
 
 
-class Painter:
+class Renderer:
     """Draws episodes in a style."""
 
-    def __init__(self, style: Style) -> None:
+    def __init__(self, style: RenderStyle) -> None:
         self.style = style
-        self._twins: OrderedDict[Any, _Twin] = OrderedDict()
+        self._scenes: OrderedDict[Any, _RenderScene] = OrderedDict()
 
-    def paint(self, subject: Subject, facts: np.void, out: Pictures) -> None:
+    def render(self, subject: RenderSubject, facts: np.void, out: Images) -> None:
         """The third-person camera's picture of a subject in the state that the facts describe.
 
         Args:
@@ -208,7 +208,7 @@ class Painter:
         Raises:
             RendererMissing: no Vulkan driver.
         """
-        colours = self._twin(subject).draw(facts, subject.hidden, out)
+        colours = self._scene_of(subject).draw(facts, subject.hidden, out)
         if self.style.overlay == "none" or subject.photo is None:
             out.rgb[:] = colours[..., :3]
             return
@@ -221,24 +221,24 @@ class Painter:
         shown = np.flatnonzero(out.segmentation)
         out.rgb.reshape(-1, 3)[shown] = colours.reshape(-1, colours.shape[-1])[shown, :3]
 
-    def _twin(self, subject: Subject) -> _Twin:
+    def _scene_of(self, subject: RenderSubject) -> _RenderScene:
         key = (subject.spec, subject.camera, subject.lighting, subject.shiny, subject.matte)
-        if key not in self._twins:
-            self._twins[key] = _Twin(subject, self.style.shadows)
-            while len(self._twins) > _TWINS:
-                self._twins.popitem(last=False)
-        self._twins.move_to_end(key)
-        return self._twins[key]
+        if key not in self._scenes:
+            self._scenes[key] = _RenderScene(subject, self.style.shadows)
+            while len(self._scenes) > _MAX_SCENES:
+                self._scenes.popitem(last=False)
+        self._scenes.move_to_end(key)
+        return self._scenes[key]
 
     def close(self) -> None:
         """Forget all twins."""
-        self._twins.clear()
+        self._scenes.clear()
 
 
-class _Twin:
+class _RenderScene:
     """A scene to be drawn."""
 
-    def __init__(self, subject: Subject, shadows: bool) -> None:
+    def __init__(self, subject: RenderSubject, shadows: bool) -> None:
         check_renderer()
         shadows = shadows or subject.lighting.casts
         self._scene = Scene(subject.spec, visuals=True)
@@ -248,7 +248,7 @@ class _Twin:
             self._draw_floor()
         self._shader = DEFAULT if shadows else MINIMAL
         self._camera = self._mount(subject.camera)
-        self._paint_surfaces(subject)
+        self._set_materials(subject)
 
     def _draw_floor(self) -> None:
         builder = self._scene.sapien.create_actor_builder()
@@ -264,7 +264,7 @@ class _Twin:
         made.set_local_pose(frame.local * sapien.Pose(list(camera.position), list(camera.quat)))
         return made
 
-    def _paint_surfaces(self, subject: Subject) -> None:
+    def _set_materials(self, subject: RenderSubject) -> None:
         if subject.shiny:
             for link in self._scene.robot.physx.links:
                 _give(link.entity, _SHINY)
@@ -273,7 +273,7 @@ class _Twin:
                 _give(thing, _MATTE)
             _let_shine(thing)
 
-    def draw(self, facts: np.void, hidden: frozenset[str], out: Pictures) -> np.ndarray:
+    def draw(self, facts: np.void, hidden: frozenset[str], out: Images) -> np.ndarray:
         """Fill segmentation and depth; returns the colours, uint8 [H, W, 3 or 4]."""
         scene = self._scene
         scene.show(facts)

@@ -3,7 +3,7 @@
 In: which scene and start a slot gets, and set-points of all slots, [B, substeps, dof]. Out: ``facts``, one row of
 ``physics.spec.facts_dtype`` a slot, and ``faults``; and pictures. A PhysX step in SAPIEN holds Python's lock, so threads
 would not help: several processes are what uses several cores. Set-points and facts lie in memory that all of them
-share; what is sent is a few bytes a tick. Pictures are drawn where their slots are, into memory that is made for them.
+share; what is sent is a few bytes a tick. Images are drawn where their slots are, into memory that is made for them.
 Workers are started as a module, so the caller's script is not imported again.
 """
 
@@ -19,19 +19,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing import reduction
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from vecenv.errors import SimulationError
+from vecenv.simpler.overlay import ImageBuffer, Images, Renderer, RendererMissing, RenderStyle, RenderSubject
 from vecenv.simpler.physics.scenes import Scene
 from vecenv.simpler.physics.spec import SceneSpec, Start, facts_dtype
 
-if TYPE_CHECKING:
-    from vecenv.simpler.overlay import Canvas, Painter, Pictures, Style, Subject
-
 # What is to be seen in each slot, and a row of facts.
-Orders: TypeAlias = "Mapping[int, tuple[Subject, np.void]]"
+Orders: TypeAlias = Mapping[int, tuple[RenderSubject, np.void]]
 
 # Scenes that no slot uses at present, kept for when one is wanted again.
 _SPARE = 8
@@ -87,8 +85,8 @@ class Slots(Protocol):
         """One control tick of the slots in ``active`` (bool [B]); ``facts`` and ``faults`` then hold what came out."""
         ...
 
-    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
-        """Pictures of the slots in ``orders``, each of a subject in a state (a row of facts); the others are 0.
+    def draw(self, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
+        """Images of the slots in ``orders``, each of a subject in a state (a row of facts); the others are 0.
 
         Raises:
             RendererMissing: no Vulkan driver.
@@ -121,7 +119,7 @@ class LocalSlots:
         self.faults = [""] * sizes.slots
         self._scenes: dict[int, Scene] = {}
         self._spare: list[Scene] = []
-        self._painter: Painter | None = None
+        self._renderer: Renderer | None = None
 
     def begin(self, jobs: Sequence[Job]) -> dict[int, np.ndarray]:
         """See ``Slots``."""
@@ -158,20 +156,18 @@ class LocalSlots:
         active[list(slots)] = True
         self.run(active, self._position, self._velocity)
 
-    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+    def draw(self, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
         """See ``Slots``."""
-        return self.draw_into(mmap.mmap(-1, canvas.bytes), style, canvas, orders)
+        return self.draw_into(mmap.mmap(-1, buffer.bytes), style, buffer, orders)
 
-    def draw_into(self, memory: mmap.mmap, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+    def draw_into(self, memory: mmap.mmap, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
         """``draw`` over a buffer."""
-        from vecenv.simpler.overlay import Painter
-
-        if self._painter is None or self._painter.style != style:
-            self._painter = Painter(style)
-        pictures = canvas.pictures(memory)
+        if self._renderer is None or self._renderer.style != style:
+            self._renderer = Renderer(style)
+        images = buffer.images(memory)
         for slot, (subject, facts) in orders.items():
-            self._painter.paint(subject, facts, pictures.of(slot))
-        return pictures
+            self._renderer.render(subject, facts, images.of(slot))
+        return images
 
     def state(self) -> list[np.ndarray]:
         """See ``Slots``."""
@@ -187,8 +183,8 @@ class LocalSlots:
         """See ``Slots``."""
         self._scenes.clear()
         self._spare.clear()
-        if self._painter is not None:
-            self._painter.close()
+        if self._renderer is not None:
+            self._renderer.close()
 
 
 class ProcessSlots:
@@ -247,20 +243,20 @@ class ProcessSlots:
         shares = self._share(np.flatnonzero(active).tolist())
         self._ask({i: ("run", slots) for i, slots in shares.items()})
 
-    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+    def draw(self, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
         """See ``Slots``."""
         handle = os.memfd_create("vecenv-simpler-pictures")
         try:
-            os.ftruncate(handle, canvas.bytes)
-            memory = mmap.mmap(handle, canvas.bytes)
+            os.ftruncate(handle, buffer.bytes)
+            memory = mmap.mmap(handle, buffer.bytes)
             shares = self._share(list(orders))
             asked = {
-                i: ("draw", (style, canvas, {slot: orders[slot] for slot in slots})) for i, slots in shares.items()
+                i: ("draw", (style, buffer, {slot: orders[slot] for slot in slots})) for i, slots in shares.items()
             }
             self._ask(asked, handle)
         finally:
             os.close(handle)
-        return canvas.pictures(memory)
+        return buffer.images(memory)
 
     def state(self) -> list[np.ndarray]:
         """See ``Slots``."""
@@ -366,19 +362,17 @@ def _serve(pipe: Connection, memory: int) -> None:
         pipe.send((True, (changed, answer)))
 
 
-def _draw(local: LocalSlots, pipe: Connection, style: Style, canvas: Canvas, orders: Orders) -> None:
+def _draw(local: LocalSlots, pipe: Connection, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> None:
     """Draw into the memory whose handle follows the request."""
     handle = reduction.recv_handle(pipe)
     try:
-        local.draw_into(mmap.mmap(handle, canvas.bytes), style, canvas, orders)
+        local.draw_into(mmap.mmap(handle, buffer.bytes), style, buffer, orders)
     finally:
         os.close(handle)
 
 
 def _sent(error: Exception) -> Exception | str:
     """What the caller gets of an error: its traceback, or itself when it says that there is no driver."""
-    from vecenv.simpler.overlay import RendererMissing
-
     return error if isinstance(error, RendererMissing) else traceback.format_exc()
 
 
