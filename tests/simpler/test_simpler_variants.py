@@ -79,9 +79,9 @@ def test_move_near_can_do_without_its_third_object() -> None:
         (
             COKE,
             {"lighting": "room"},
-            "lighting='room' is not there for google_robot_pick_coke_can; expected one of bri",
+            "lighting='room' is not available for google_robot_pick_coke_can; expected one of bri",
         ),
-        (COKE, {"station": "mk_station2"}, "station='mk_station2' is not there for .*; expected none at all"),
+        (COKE, {"station": "mk_station2"}, "station='mk_station2' is not available for .*; expected none at all"),
         (OPEN, {"stage": "modern_bedroom_no_roof"}, "stage='modern_bedroom_no_roof' is not there"),
         (OPEN, {"distractors": "less"}, "distractors='less' is not there"),
         (NEAR, {"distractors": "more"}, "expected one of none"),

@@ -1,9 +1,9 @@
 """The SIMPLER environment: layouts, scenes, controllers and success criteria behind the verbs of ``vecenv.contract``.
 
 A batch of slots, each with one episode of one task of ``simpler/bridge`` (WidowX, 5 Hz) or ``simpler/google_robot``
-(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``robots.py`` for what becomes of an action,
-``scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so actions of the whole
-batch become set-points in one call; scenes are stepped one by one, spread over worker processes.
+(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``control/robots.py`` for how an action becomes
+set-points, ``physics/scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so
+actions of the whole batch become set-points in one call; scenes are stepped one by one, in worker processes.
 
 An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in the axes of the robot's base;
 ``vecenv/actions.py`` has the table of conventions.
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
@@ -52,8 +53,8 @@ _MAX_OBJECTS = 8
 class SimplerEnv(SlotBatch):
     """A batch of SIMPLER episodes; see ``vecenv.make``.
 
-    ``step_ee_pose`` moves as fast as ``config.servo`` lets it, and where it holds, it holds still where the last call
-    led. Its poses are those of the tool (WidowX ``ee_gripper_link``, Google Robot ``link_gripper_tcp``).
+    ``step_ee_pose`` moves as fast as ``config.servo`` allows; where it holds, it keeps the pose that the last call
+    led to. Its poses are those of the tool (WidowX ``ee_gripper_link``, Google Robot ``link_gripper_tcp``).
 
     Args:
         suite: ``simpler/bridge`` or ``simpler/google_robot``.
@@ -118,7 +119,7 @@ class SimplerEnv(SlotBatch):
 
     @property
     def specs(self) -> tuple[EpisodeSpec, ...]:
-        """For each slot, what its list says of the episode; ``config.variant`` comes on top."""
+        """For each slot, its episode's row in the published list; ``config.variant`` is applied on top."""
         return tuple(self._spec(*self._key(slot)) for slot in range(self.num_envs))
 
     def _instruction(self, slot: int) -> str:
@@ -129,8 +130,8 @@ class SimplerEnv(SlotBatch):
     def _label(self, task: int) -> str:
         return self.tasks[task].name
 
-    def advance_subtask(self, slots: Any = None) -> None:
-        """Tell slots (bool [B], all by default) of tasks in two halves that the first half is done."""
+    def advance_subtask(self, slots: npt.ArrayLike | None = None) -> None:
+        """Begin the second half in slots (bool [B], all by default) of tasks that have two."""
         chosen = np.ones(self.num_envs, bool) if slots is None else np.asarray(slots, bool)
         for slot in np.flatnonzero(chosen):
             judge = self._judges[slot]
@@ -168,7 +169,7 @@ class SimplerEnv(SlotBatch):
 
     # -- stepping ------------------------------------------------------------------------------------------------------
 
-    def step_continuous(self, actions: Any) -> Control:
+    def step_continuous(self, actions: npt.ArrayLike) -> Control:
         """Advance by one control tick, or by a chunk of K.
 
         Args:
@@ -178,7 +179,7 @@ class SimplerEnv(SlotBatch):
             ActionError: not numbers, or another shape.
         """
         self._check_live()
-        chunk, mended = action_space.continuous(actions, self.num_envs, ACTION_LIMITS)
+        chunk, sanitized = action_space.continuous(actions, self.num_envs, ACTION_LIMITS)
         chunk[..., 6] = self._native_gripper(chunk[..., 6])
         self._servo.forget(np.ones(self.num_envs, bool))
         before, reward = self._steps.copy(), np.zeros(self.num_envs)
@@ -186,7 +187,7 @@ class SimplerEnv(SlotBatch):
             if self._done.all():
                 break
             reward += self._tick(chunk[:, tick], ~self._done)
-        return self._control(Control, reward, before, mended)
+        return self._control(Control, reward, before, sanitized)
 
     def _native_gripper(self, values: np.ndarray) -> np.ndarray:
         return values if self.config.gripper == "native" else self._servo.gripper(values)
@@ -214,7 +215,7 @@ class SimplerEnv(SlotBatch):
     def _failures(self) -> Mapping[int, str]:
         return {slot: reason for slot, reason in enumerate(self.slots.faults) if reason}
 
-    def _diagnostics(self) -> dict[str, Any]:
+    def _diagnostics(self) -> dict[str, object]:
         return {"parts": tuple(verdict.parts for verdict in self._verdicts), "stand_ins": self.stand_ins}
 
     def _tools(self) -> np.ndarray:
@@ -242,7 +243,7 @@ class SimplerEnv(SlotBatch):
     # -- perception ----------------------------------------------------------------------------------------------------
 
     def observe_egocentric(self) -> Egocentric:
-        """What every slot's camera sees now, and its joints; pictures are drawn when they are first read.
+        """What every slot's camera sees now, and its joints; images are rendered when they are first read.
 
         ``state`` is qpos, qvel and base pose (xyz, wxyz), float32 [B, 23] or [B, 29]. The only camera is the
         third-person one, 480 x 640 or 512 x 640; ``wrist_image`` is None. A slot whose physics failed shows black.
@@ -291,7 +292,7 @@ class SimplerEnv(SlotBatch):
 
     @property
     def stand_ins(self) -> tuple[tuple[str, ...], ...]:
-        """For each slot, what files are missing and what stands in for them."""
+        """For each slot, notes about missing files and what stands in for them."""
         return tuple(episode.notes for episode in self._episodes)
 
     # -- physics state -------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
-"""From an episode's layout to what physics needs: the scene, the start, and who is who.
+"""From an episode's layout to what physics needs: the scene, the start, and the objects' roles.
 
 In: a ``Layout`` (``layouts.py``) and the asset tree. Out: ``Episode``: a ``SceneSpec`` that equal episodes share, a
-``Start``, the ``Roles`` that judging needs, and a note for every file that something plain stands in for.
+``Start``, the ``Roles`` that judging needs, and a note for every file that a plain shape stands in for.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class Episode:
 
     Attributes:
         task: its task. layout: where everything is.
-        spec: the scene. start: where it begins. roles: who is who.
+        spec: the scene. start: where it begins. roles: of the objects.
         notes: what is missing and what stands in for it.
-        undrawn: missing files that physics does without but pictures need: path in the asset tree, and what it is.
+        undrawn: missing files that only rendering needs: path in the asset tree, and what it is.
     """
 
     task: SimplerTask
@@ -80,7 +80,7 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
     models = read_models(root / task.models_path) if task.models_path else {}
     notes: list[str] = []
     spec = SceneSpec(
-        # The robot's versions differ in colour only, so scenes without pictures share the plain one.
+        # The robot's versions differ in colour only, so physics scenes share the plain one.
         robot=robot_body(task.robot, root / task.robot.urdf_path(), layout.qpos),
         sim_hz=task.sim_hz,
         contact_offset=task.contact_offset,
@@ -187,10 +187,10 @@ def _undrawn(task: SimplerTask, root: Path) -> tuple[str, ...]:
 
 
 def require_drawable(episode: Episode, root: Path) -> None:
-    """Whether everything is there that pictures of an episode need.
+    """Check that every file is there that rendering an episode needs.
 
     Raises:
-        AssetsMissing: something is not; the message names the file.
+        AssetsMissing: a file is missing; the message names it.
     """
     if episode.undrawn:
         raise AssetsMissing(assets.NAME, f"{root} has no {episode.undrawn[0]}", assets.HOW_TO_GET_VARIANTS)

@@ -1,11 +1,11 @@
-"""What an episode of SIMPLER consists of: which objects, where they are dropped, where the robot stands, what is said.
+"""What an episode of SIMPLER consists of: objects, where they are dropped, where the robot stands, the instruction.
 
 In: a task and its ``Choices``: the robot's place, the object's, the drawer, the arrangement. They are drawn from a seed
-(``drawn``) or come from a published list (``published/lists.py``). Out: a ``Layout`` (``lay_out``). Draws are made by NumPy's
+(``drawn``) or come from a published list (``published/lists.py``). Out: a ``Layout`` (``lay_out``). Draws use NumPy's
 ``RandomState`` alone, draw for draw as upstream does it (ManiSkill2_real2sim commit ef7a4d4, ``envs/custom_scenes``).
 Each class of upstream's hierarchy starts the episode's stream anew, so draws of different layers are made from equal
 streams: that is why several functions begin with a fresh ``RandomState(seed)``. Objects are given where they are
-dropped, half a metre above the table; where they end is the simulator's business.
+dropped, half a metre above the table; the simulator lets them settle.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from types import MappingProxyType
-from typing import Any, TypedDict
+from typing import Required, TypedDict
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Choices:
         robot_xy: where the robot's root link stands, metres, world frame.
         robot_quat: of the root link, wxyz.
         urdf_version: which of the robot's versions; "" is the plain one.
-        overlay: picture that replaces the background, in the asset tree; None where the drawn scene is shown.
+        overlay: image that replaces the background, in the asset tree; None where the drawn scene is shown.
         model: of ``pick`` and ``place``, the object.
         object_xy: of ``pick`` and ``place``, above which point the object is dropped, metres, world frame.
         orientation: of ``pick``, how the object lies: one of ``ORIENTATIONS``.
@@ -78,7 +78,7 @@ class Placed:
 
     Attributes:
         model: its name, also of its folder in the asset tree.
-        role: ``source`` (what is to be moved), ``target``, ``other``, ``distractor`` (likewise, but dropped when the
+        role: ``source`` (the object to move), ``target``, ``other``, ``distractor`` (likewise, but dropped when the
             rest has settled), or ``fixture`` (does not move).
         position: metres, world frame; where it is dropped, or stands.
         quat: wxyz, world frame.
@@ -105,11 +105,11 @@ class Layout:
         base_quat: wxyz.
         qpos: the robot's joints, radians and metres, in the order of ``Robot.joints``.
         urdf_version: which of the robot's versions.
-        overlay: picture that replaces the background, in the asset tree; None where the drawn scene is shown.
+        overlay: image that replaces the background, in the asset tree; None where the drawn scene is shown.
         drawer: which drawer the task is about, "" when none.
         drawer_qpos: how far it is open at first, metres.
-        instruction: what a policy is told at first.
-        second_instruction: what it is told in the second half of a ``place`` episode, else "".
+        instruction: the policy's instruction at first.
+        second_instruction: its instruction in the second half of a ``place`` episode, else "".
         orientation: of ``pick``, how the object lies.
         episode_id: upstream's number of the arrangement, None where it has none.
     """
@@ -133,6 +133,18 @@ class Layout:
     def with_role(self, role: str) -> tuple[Placed, ...]:
         """The objects of a role."""
         return tuple(placed for placed in self.objects if placed.role == role)
+
+
+class _FamilyFields(TypedDict, total=False):
+    """Fields of a ``Layout`` that depend on the task's family."""
+
+    objects: Required[tuple[Placed, ...]]
+    instruction: Required[str]
+    second_instruction: str
+    orientation: str
+    episode_id: int
+    drawer: str
+    drawer_qpos: float
 
 
 def episode_seed(episode: int) -> int:
@@ -245,7 +257,7 @@ DRAWER_STATIONS: Mapping[str, Station] = MappingProxyType(
         "c2": (0.865, 0.222, -0.025),
     }
 )
-"""Where the real robot stood when the pictures of the drawers were taken."""
+"""Where the real robot stood when the images of the drawers were taken."""
 
 
 class Stand(TypedDict):
@@ -298,7 +310,7 @@ def _draw_pick(task: SimplerTask, seed: int) -> Choices:
     )
 
 
-def _pick(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _pick(task: SimplerTask, choices: Choices) -> _FamilyFields:
     turns = {"upright": _roll(math.pi / 2), "laid_vertically": _yaw(math.pi / 2), "lr_switch": _yaw(math.pi)}
     quat = turns[_known("orientation", choices.orientation, turns)]
     return {
@@ -344,7 +356,7 @@ def _arrangement(task: SimplerTask, choices: Choices) -> int:
     return number
 
 
-def _move_near(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _move_near(task: SimplerTask, choices: Choices) -> _FamilyFields:
     episode = _arrangement(task, choices)
     triplet, corners = task.triplets[episode // _PER_TRIPLET], _TRIANGLES[episode % _PER_TRIPLET // len(_PAIRS)]
     source, target = _PAIRS[episode % len(_PAIRS)]
@@ -375,7 +387,7 @@ def _standing(model: str) -> Quat:
 
 
 def _draw_station(task: SimplerTask, seed: int) -> Choices:
-    """Drawer, picture and URDF version, drawn from one stream."""
+    """Drawer, image and URDF version, drawn from one stream."""
     rng = _stream(seed)
     drawer = str(rng.choice(list(task.drawers)))
     overlay = task.overlays[int(rng.choice(len(task.overlays)))]
@@ -384,7 +396,7 @@ def _draw_station(task: SimplerTask, seed: int) -> Choices:
     return Choices(seed=seed, **stand(station), urdf_version=version, overlay=overlay, drawer=drawer)
 
 
-def _drawer(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _drawer(task: SimplerTask, choices: Choices) -> _FamilyFields:
     drawer = _known("drawer", choices.drawer, DRAWERS)
     return {
         "objects": (),
@@ -400,7 +412,7 @@ def _draw_place(task: SimplerTask, seed: int) -> Choices:
     return replace(_draw_station(task, seed), model=model, object_xy=(float(x), float(y)))
 
 
-def _place(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _place(task: SimplerTask, choices: Choices) -> _FamilyFields:
     drawer = _known("drawer", choices.drawer, DRAWERS)
     return {
         "objects": (_source(task, choices, _UPRIGHT),),
@@ -421,7 +433,7 @@ def _draw_put_on(task: SimplerTask, seed: int) -> Choices:
     return Choices(seed=seed, **stand(put_on_station(task)), overlay=task.overlays[0], episode_id=episode)
 
 
-def _put_on(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _put_on(task: SimplerTask, choices: Choices) -> _FamilyFields:
     corners, turns = _put_on_choices(task.name)
     episode = _arrangement(task, choices)
     places, turn = corners[episode // len(turns)], turns[episode % len(turns)]

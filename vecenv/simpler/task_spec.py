@@ -16,7 +16,7 @@ from vecenv.simpler.control.robots import Robot
 
 BRIDGE, GOOGLE = "simpler/bridge", "simpler/google_robot"
 DATA = PurePosixPath("data")
-"""Folder of objects, stages and pictures in the asset tree."""
+"""Folder of objects, stages and images in the asset tree."""
 
 DRAWERS = ("top", "middle", "bottom")
 ORIENTATIONS = ("upright", "laid_vertically", "lr_switch")
@@ -190,7 +190,7 @@ class SimplerTask:
         index: place in the suite, from 0, in upstream's order.
         name: upstream's name.
         family: ``pick``, ``move_near``, ``open``, ``close``, ``place`` or ``put_on``.
-        instruction: what a policy is told; words in capitals depend on the episode (see ``Layout.instruction``).
+        instruction: the policy's instruction; words in capitals depend on the episode (see ``Layout.instruction``).
         robot: the robot.
         max_steps: step budget, control steps.
         models: objects an episode chooses from; of ``put_on``, source and target.
@@ -201,8 +201,8 @@ class SimplerTask:
         stage: surroundings.
         station: the cabinet's URDF file in the asset tree, or None.
         contact_offset: PhysX's, metres.
-        overlays: real pictures that replace the background, in the asset tree; an episode chooses one.
-        always_overlaid: objects that the picture replaces too.
+        overlays: photographs that replace the background, in the asset tree; an episode chooses one.
+        always_overlaid: objects that the photograph replaces too.
         camera: the third-person camera.
         lighting: light.
         ray_traced: upstream draws it with its ray tracer.

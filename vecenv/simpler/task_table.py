@@ -146,7 +146,7 @@ PLAIN_MODELS_FILE = "info_pick_custom_v0.json"
 """Sizes and densities of the objects of ``pick`` and of those groups."""
 
 
-def _google(name: str, family: str, instruction: str, success: Success, **fields: Any) -> dict[str, Any]:
+def _google(name: str, family: str, instruction: str, success: Success, **fields: object) -> dict[str, Any]:
     return {
         "suite": GOOGLE,
         "name": f"google_robot_{name}",
@@ -231,7 +231,9 @@ def _place(name: str, which: str | None, models: tuple[str, ...] = PLACE_MODELS)
     )
 
 
-def _put_on(name: str, instruction: str, source: str, target: str, success: Success, **fields: Any) -> dict[str, Any]:
+def _put_on(
+    name: str, instruction: str, source: str, target: str, success: Success, **fields: object
+) -> dict[str, Any]:
     return {
         "suite": BRIDGE,
         "name": f"widowx_{name}",

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,9 @@ _ON_TABLE, _AT_CABINET = ("pick", "move_near"), ("open", "close", "place")
 _GOOGLE_FAMILIES = (*_ON_TABLE, *_AT_CABINET)
 _COKE = "opened_coke_can"
 _AMBIENT = (0.3, 0.3, 0.3)
+
+
+_T = TypeVar("_T")
 
 
 class VariantError(InvalidInput):
@@ -106,7 +109,7 @@ class Variant:
     distractors: str | None = None
 
 
-def make_variant(given: Variant | Mapping[str, Any] | None) -> Variant | None:
+def make_variant(given: Variant | Mapping[str, str | None] | None) -> Variant | None:
     """A variant as it is, or of a mapping of its fields.
 
     Raises:
@@ -125,7 +128,7 @@ def varied(task: SimplerTask, layout: Layout, variant: Variant | None) -> tuple[
     """An episode's task and layout under a variant.
 
     Raises:
-        VariantError: the variant has nothing to say about this task; the message says what it may be.
+        VariantError: the variant does not apply to this task; the message lists those that do.
     """
     if variant is None or variant == Variant():
         return task, layout
@@ -161,10 +164,10 @@ def _task_changes(task: SimplerTask, variant: Variant) -> dict[str, Any]:
     return changes
 
 
-def _chosen(task: SimplerTask, what: str, value: str, known: Mapping[str, Any]) -> Any:
+def _chosen(task: SimplerTask, what: str, value: str, known: Mapping[str, _T]) -> _T:
     if value not in known:
         there = f"one of {', '.join(known)}" if known else "none at all"
-        raise VariantError(f"variant: {what}={value!r} is not there for {task.name}; expected {there}")
+        raise VariantError(f"variant: {what}={value!r} is not available for {task.name}; expected {there}")
     return known[value]
 
 

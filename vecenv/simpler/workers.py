@@ -1,10 +1,10 @@
-"""Many slots: scenes side by side in this process, or spread over worker processes.
+"""The physics of a batch: scenes in this process, or spread over worker processes.
 
 In: which scene and start a slot gets, and set-points of all slots, [B, substeps, dof]. Out: ``facts``, one row of
-``physics.spec.facts_dtype`` a slot, and ``faults``; and pictures. A PhysX step in SAPIEN holds Python's lock, so threads
-would not help: several processes are what uses several cores. Set-points and facts lie in memory that all of them
-share; what is sent is a few bytes a tick. Images are drawn where their slots are, into memory that is made for them.
-Workers are started as a module, so the caller's script is not imported again.
+``physics.spec.facts_dtype`` a slot, ``faults``, and images. A PhysX step in SAPIEN holds Python's lock, so several
+processes and not threads use several cores. Set-points and facts lie in shared memory, so a message is a few bytes a
+tick. Each process renders its own slots, into shared memory that is allocated for the images. Workers are started as a
+module, so the caller's script is not imported again.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from vecenv.simpler.overlay import ImageBuffer, Images, Renderer, RendererMissin
 from vecenv.simpler.physics.scenes import Scene
 from vecenv.simpler.physics.spec import SceneSpec, Start, facts_dtype
 
-# What is to be seen in each slot, and a row of facts.
+# Slot -> what to render, and a row of facts.
 Orders: TypeAlias = Mapping[int, tuple[RenderSubject, np.void]]
 
-# Scenes that no slot uses at present, kept for when one is wanted again.
+# Unused scenes that are kept for later episodes.
 _SPARE = 8
 
 
@@ -50,7 +50,7 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """How large the shared arrays are: B slots, substeps a tick, joints, objects."""
+    """Sizes of the shared arrays: B slots, substeps per tick, joints, objects."""
 
     slots: int
     substeps: int
@@ -59,10 +59,10 @@ class Sizes:
 
     @property
     def bytes(self) -> int:
-        """Of all arrays together."""
+        """Size of all arrays together, bytes."""
         return self.slots * (facts_dtype(self.dof, self.objects).itemsize + 2 * 8 * self.substeps * self.dof)
 
-    def arrays(self, memory: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def arrays(self, memory: mmap.mmap | bytearray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Facts [B], set-points of positions and of velocities [B, S, N], over a buffer."""
         dtype, count = facts_dtype(self.dof, self.objects), self.slots * self.substeps * self.dof
         shape, begin = (self.slots, self.substeps, self.dof), self.slots * dtype.itemsize
@@ -72,7 +72,7 @@ class Sizes:
 
 
 class Slots(Protocol):
-    """What both ways of running slots offer."""
+    """Physics of a batch, in this process or in workers."""
 
     facts: np.ndarray
     faults: list[str]
@@ -82,7 +82,7 @@ class Slots(Protocol):
         ...
 
     def run(self, active: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
-        """One control tick of the slots in ``active`` (bool [B]); ``facts`` and ``faults`` then hold what came out."""
+        """One control tick of the slots in ``active`` (bool [B]); ``facts`` and ``faults`` then hold the results."""
         ...
 
     def draw(self, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
@@ -114,7 +114,7 @@ class LocalSlots:
         memory: buffer that they lie in; None for memory of their own.
     """
 
-    def __init__(self, sizes: Sizes, memory: Any = None) -> None:
+    def __init__(self, sizes: Sizes, memory: mmap.mmap | None = None) -> None:
         self.facts, self._position, self._velocity = sizes.arrays(bytearray(sizes.bytes) if memory is None else memory)
         self.faults = [""] * sizes.slots
         self._scenes: dict[int, Scene] = {}
@@ -213,8 +213,8 @@ class ProcessSlots:
             shares.setdefault(self._owner(int(slot)), []).append(int(slot))
         return shares
 
-    def _ask(self, asked: dict[int, tuple[str, Any]], handle: int | None = None) -> dict[int, Any]:
-        """Send every worker its request, and a file handle if there is one; then collect every answer."""
+    def _ask(self, asked: Mapping[int, tuple[str, object]], handle: int | None = None) -> dict[int, Any]:
+        """Send every worker its request, with a file handle if given; then collect every answer."""
         for index, request in asked.items():
             self._workers[index].send(request, handle)
         received = {index: self._workers[index].receive() for index in asked}
@@ -245,7 +245,7 @@ class ProcessSlots:
 
     def draw(self, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
         """See ``Slots``."""
-        handle = os.memfd_create("vecenv-simpler-pictures")
+        handle = os.memfd_create("vecenv-simpler-images")
         try:
             os.ftruncate(handle, buffer.bytes)
             memory = mmap.mmap(handle, buffer.bytes)
@@ -282,7 +282,7 @@ class ProcessSlots:
 
 
 class _Worker:
-    """One process, and the pipe to it."""
+    """A worker process and the pipe to it."""
 
     def __init__(self, sizes: Sizes, memory: int, environment: dict[str, str]) -> None:
         mine, theirs = socket.socketpair()
@@ -295,7 +295,7 @@ class _Worker:
         self._pipe = Connection(mine.detach())
         self.send(sizes)
 
-    def send(self, message: Any, handle: int | None = None) -> None:
+    def send(self, message: object, handle: int | None = None) -> None:
         try:
             self._pipe.send(message)
             if handle is not None:
@@ -304,7 +304,7 @@ class _Worker:
             raise self._gone() from error
 
     def receive(self) -> tuple[bool, Any]:
-        """Whether it worked, and the answer or else what ``_sent`` made of the error."""
+        """Whether the request succeeded, and its answer, or the error as ``_sendable`` returns it."""
         try:
             return self._pipe.recv()
         except (EOFError, OSError) as error:
@@ -323,7 +323,7 @@ class _Worker:
 
 
 def _environment(workers: int) -> dict[str, str]:
-    """A worker's: the module search path of this process, one thread for numerics, its share of the cores for Mesa."""
+    """A worker's environment: this process's module path, one thread for numerics, its share of the cores for Mesa."""
     paths = [path for path in sys.path if path]
     cores = max(1, len(os.sched_getaffinity(0)) // workers)
     own = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
@@ -336,7 +336,7 @@ def make_slots(sizes: Sizes, workers: int) -> LocalSlots | ProcessSlots:
 
 
 def _serve(pipe: Connection, memory: int) -> None:
-    """A worker's life: requests until the pipe closes."""
+    """A worker's main loop: answer requests until the pipe closes."""
     sizes: Sizes = pipe.recv()
     local = LocalSlots(sizes, mmap.mmap(memory, sizes.bytes))
     calls = {
@@ -355,7 +355,7 @@ def _serve(pipe: Connection, memory: int) -> None:
         try:
             answer = calls[name](argument)
         except Exception as error:
-            pipe.send((False, _sent(error)))
+            pipe.send((False, _sendable(error)))
             continue
         changed = {slot: fault for slot, fault in enumerate(local.faults) if known.get(slot, "") != fault}
         known.update(changed)
@@ -371,8 +371,8 @@ def _draw(local: LocalSlots, pipe: Connection, style: RenderStyle, buffer: Image
         os.close(handle)
 
 
-def _sent(error: Exception) -> Exception | str:
-    """What the caller gets of an error: its traceback, or itself when it says that there is no driver."""
+def _sendable(error: Exception) -> Exception | str:
+    """An error as it is sent to the caller: ``RendererMissing`` itself, else the traceback."""
     return error if isinstance(error, RendererMissing) else traceback.format_exc()
 
 

@@ -150,7 +150,7 @@ def _git_blob(file: Path, size: int) -> str:
 
 
 def default_root() -> Path:
-    """Folder that ``vecenv assets pull simpler`` fills unless told otherwise."""
+    """Folder that ``vecenv assets pull simpler`` fills by default."""
     named = os.environ.get(VARIABLE)
     return Path(named).expanduser() if named else platformdirs.user_data_path("vecenv") / "simpler"
 
@@ -216,7 +216,7 @@ class Resolved:
 
 @dataclass(frozen=True, kw_only=True)
 class _Table:
-    """Height of a stage's table, metres; ``proof``: how that is known."""
+    """Height of a stage's table, metres; ``proof``: how it is known."""
 
     top: float
     proof: str

@@ -84,7 +84,7 @@ class Chain:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Joint positions that bring the link to a pose, starting from ``qpos``.
 
-        Joint limits are not heeded, joints off the chain stay.
+        Joint limits are ignored; joints that are not in the chain keep their positions.
 
         Args:
             qpos: where the joints are, [B, N].

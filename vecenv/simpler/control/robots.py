@@ -17,9 +17,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.controllers.interpolate import Limits, Planner
 from vecenv.errors import InvalidInput
@@ -260,7 +261,7 @@ class SetPoints(NamedTuple):
     Attributes:
         position: set-point at the end of each substep, radians (WidowX's fingers: metres), [B, S, N].
         velocity: rad/s or m/s, likewise; 0 where only positions are commanded.
-        solved: the inverse kinematics found the pose, bool [B]; where it did not the arm is told to stay.
+        solved: the inverse kinematics found the pose, bool [B]; where it did not, the arm keeps its position.
     """
 
     position: np.ndarray
@@ -287,12 +288,14 @@ class Controller:
         # What a slot remembers from one control step to the next; see ``memory``.
         self._memory: dict[str, np.ndarray] = {"held": np.zeros((count, robot.dof))}
 
-    def reset(self, mask: Any, qpos: Any) -> None:
-        """Forget what the slots in ``mask`` (bool [B]) remember; their robots stand at ``qpos`` [B, N]."""
+    def reset(self, mask: npt.ArrayLike, qpos: npt.ArrayLike) -> None:
+        """Clear the memory of the slots in ``mask`` (bool [B]); their robots stand at ``qpos`` [B, N]."""
         chosen = self._flags("mask", mask)
         self._begin(chosen, self._rows("qpos", qpos, self.robot.dof)[chosen])
 
-    def set_action(self, action: Any, qpos: Any, qvel: Any, active: Any = None) -> SetPoints:
+    def set_action(
+        self, action: npt.ArrayLike, qpos: npt.ArrayLike, qvel: npt.ArrayLike, active: npt.ArrayLike | None = None
+    ) -> SetPoints:
         """Set-points of the coming control step.
 
         Args:
@@ -300,7 +303,7 @@ class Controller:
             qpos: measured joint positions, [B, N].
             qvel: measured joint velocities, [B, N].
             active: slots that take the action, bool [B], all by default; the others hold their last set-points and
-                remember what they did.
+                keep their memory.
 
         Raises:
             RobotError: a shape does not match.
@@ -315,12 +318,12 @@ class Controller:
             self._memory["held"][rows] = position[rows, -1]
         return SetPoints(position, velocity, solved)
 
-    def tool(self, qpos: Any) -> np.ndarray:
+    def tool(self, qpos: npt.ArrayLike) -> np.ndarray:
         """Pose of the tool in the root's frame, xyz (metres) and wxyz, [B, 7]."""
         position, rotation = self.chain.pose(qpos)
         return np.concatenate([position, quat_from_rotation(rotation)], axis=1)
 
-    def towards(self, pose: Any, qpos: Any) -> np.ndarray:
+    def towards(self, pose: npt.ArrayLike, qpos: npt.ArrayLike) -> np.ndarray:
         """The action's first six columns, [B, 6], that make ``pose`` [B, 7] (xyz, wxyz, root frame) the next target."""
         poses = self._rows("pose", pose, 7)
         return self._delta(poses[:, :3], rotation_from_quat(poses[:, 3:]), self._rows("qpos", qpos, self.robot.dof))
@@ -329,7 +332,7 @@ class Controller:
         """A copy of what the slots remember, arrays with B rows; ``restore`` takes it back."""
         return {name: values.copy() for name, values in self._memory.items()}
 
-    def restore(self, memory: Mapping[str, np.ndarray], mask: Any = None) -> None:
+    def restore(self, memory: Mapping[str, np.ndarray], mask: npt.ArrayLike | None = None) -> None:
         """Set what the slots in ``mask`` (bool [B], all by default) remember."""
         if set(memory) != set(self._memory):
             raise RobotError(f"memory has {sorted(memory)}; {self.robot.name} remembers {sorted(self._memory)}")
@@ -349,13 +352,13 @@ class Controller:
     def _delta(self, position: np.ndarray, rotation: np.ndarray, qpos: np.ndarray) -> np.ndarray:
         raise NotImplementedError
 
-    def _rows(self, name: str, value: Any, width: int) -> np.ndarray:
+    def _rows(self, name: str, value: npt.ArrayLike, width: int) -> np.ndarray:
         rows = np.asarray(value, np.float64)
         if rows.shape != (self.count, width):
             raise RobotError(f"{name} must have shape [{self.count}, {width}], got {list(rows.shape)}")
         return rows
 
-    def _flags(self, name: str, value: Any) -> np.ndarray:
+    def _flags(self, name: str, value: npt.ArrayLike) -> np.ndarray:
         flags = np.asarray(value)
         if flags.shape != (self.count,) or flags.dtype != np.bool_:
             raise RobotError(f"{name} must be bool [{self.count}], got {flags.dtype} {list(flags.shape)}")

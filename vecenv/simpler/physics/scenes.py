@@ -147,7 +147,7 @@ class Scene:
             step()
 
     def _command(self, targets: np.ndarray, velocities: np.ndarray | None) -> list[tuple[Any, list[float]]]:
-        """Set what stays the same for the whole tick; returns the rest, column by column."""
+        """Set the targets that are constant in this tick; returns the others, column by column."""
         moving = []
         columns = [(joint.set_drive_target, targets[:, i]) for i, joint in self.robot.joints.items()]
         if velocities is not None:
@@ -159,7 +159,7 @@ class Scene:
         return moving
 
     def _stop_for(self, targets: np.ndarray) -> Callable[[int], None] | None:
-        """What keeps two fingers from passing through each other in this tick; None when they are not told to."""
+        """What keeps two fingers from passing through each other in this tick; None when no targets do."""
         if self.spec.robot.stop is None:
             return None
         one, two, total = self.spec.robot.stop
@@ -186,7 +186,7 @@ class Scene:
     # -- measuring -----------------------------------------------------------------------------------------------------
 
     def measure(self, row: np.void) -> str:
-        """Write what is measured now into a row of ``facts_dtype``; returns what is wrong with it, "" if nothing."""
+        """Write what is measured now into a row of ``facts_dtype``; returns what is wrong, "" if nothing."""
         count = len(self.objects)
         row["qpos"], row["qvel"] = self.robot.qpos, self.robot.qvel
         row["tcp"] = vector(self.robot.frames[self.spec.robot.tcp].pose)
@@ -244,14 +244,14 @@ class Scene:
     # -- state ---------------------------------------------------------------------------------------------------------
 
     def state(self) -> np.ndarray:
-        """All there is to restore: qpos, qvel of the robot, of the cabinet, then pose and velocity of the objects."""
+        """The physics state: qpos, qvel of the robot, of the cabinet, then pose and velocity of the objects."""
         parts = [self.robot.qpos, self.robot.qvel]
         if self.cabinet is not None:
             parts += [self.cabinet.qpos, self.cabinet.qvel]
         return np.concatenate([*parts, self._object_states().ravel()]).astype(float)
 
     def restore(self, state: np.ndarray) -> None:
-        """Undo of ``state``."""
+        """Restore a physics state from ``state``."""
         rest = np.asarray(state, float)
         for articulation in (self.robot, self.cabinet):
             if articulation is not None:
@@ -261,7 +261,7 @@ class Scene:
         self._restore_objects(rest.reshape(-1, 13))
 
     def show(self, facts: np.void) -> None:
-        """Stand like the slot that a row of facts was measured in, at rest."""
+        """Take the poses of a row of facts, at rest."""
         self.robot.place(facts["qpos"].astype(np.float32))
         self.robot.physx.set_root_pose(pose_of(facts["base"]))
         if self.cabinet is not None:
@@ -270,7 +270,7 @@ class Scene:
             entity.set_pose(pose_of(pose))
 
 
-def _release(body: Any) -> None:
+def _release(body: physx.PhysxRigidDynamicComponent) -> None:
     body.set_locked_motion_axes(_FREE)
     # PhysX puts resting bodies to sleep; setting the pose wakes them, as upstream does.
     body.entity.set_pose(body.entity.pose)
@@ -278,7 +278,7 @@ def _release(body: Any) -> None:
     body.wake_up()
 
 
-def _moving(bodies: Sequence[Any]) -> bool:
+def _moving(bodies: Sequence[physx.PhysxRigidDynamicComponent]) -> bool:
     linear = sum(np.linalg.norm(body.linear_velocity) for body in bodies)
     angular = sum(np.linalg.norm(body.angular_velocity) for body in bodies)
     return bool(linear > _STILL_LINEAR or angular > _STILL_ANGULAR)

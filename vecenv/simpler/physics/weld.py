@@ -3,7 +3,7 @@
 In: a SAPIEN scene, a URDF file, what its links are made of. Out: an ``Articulation`` whose joints and frames are
 addressed by the URDF's names. Welding changes nothing that can move: masses, centres and inertias are combined exactly.
 It makes a physics step cheaper, because the solver passes over every link and because shapes of one body are never
-tested against each other (the Google Robot has 37 links for 11 joints). Visual shapes are left out unless asked for, so
+tested against each other (the Google Robot has 37 links for 11 joints). Visual shapes are left out by default, so
 that physics needs no Vulkan.
 """
 
@@ -49,7 +49,7 @@ class Articulation:
 
     Attributes:
         physx: SAPIEN's articulation.
-        joints: column of a named joint -> the joint, without those that are frozen, in the order asked for.
+        joints: column of a named joint -> the joint, without those that are frozen, in the requested order.
         order: index of each of ``joints`` in SAPIEN's qpos.
         frames: every link of the URDF by name.
         frozen: angles of the frozen joints, 0 for the others, float32 [dof].
@@ -112,7 +112,7 @@ def load(
     Args:
         scene: where it goes.
         urdf: the file.
-        joints: names of the active joints, in the order that ``Articulation`` shall use.
+        joints: names of the active joints, in the order that ``Articulation`` uses.
         surfaces: link name -> surface; others have friction 1.
         ignored: link name -> bit set; links that share a bit never collide.
         many_hulls: whether a collision mesh file holds several convex hulls.

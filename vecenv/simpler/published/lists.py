@@ -26,7 +26,7 @@ Visual matching's 4 are the robot's colours; variant aggregation's 11, 10 and 7 
 for Octo run the same episodes (visual matching's cans at 501 physics steps a second instead of 513).
 ``move_near_v0`` is what the script runs, ``move_near_v1`` the alternative that it names in a comment, and ``move_near``
 is that too; in variant aggregation all three are the one environment that the script runs. Tasks without a sweep of
-their own have what the script for prepackaged environments runs unless told otherwise: ten resets in a row.
+their own have what the script for prepackaged environments runs by default: ten resets in a row.
 """
 
 from __future__ import annotations
@@ -103,10 +103,10 @@ def _checked(protocol: str, task: str) -> tuple[EpisodeSpec, ...]:
 
 
 def check_protocol(protocol: str) -> str:
-    """The protocol, if there is such a one.
+    """The protocol, if it exists.
 
     Raises:
-        PublishedError: there is not.
+        PublishedError: it does not.
     """
     if protocol not in PROTOCOLS:
         raise PublishedError(f"protocol={protocol!r} is not available; available: {', '.join(PROTOCOLS)}")
@@ -114,7 +114,7 @@ def check_protocol(protocol: str) -> str:
 
 
 def counts(protocol: str, suite: str) -> dict[int, int]:
-    """Index of a task -> how many episodes a protocol has of it, for those tasks of a suite that it has any of.
+    """Index of a task -> how many episodes a protocol has of it, for the tasks of a suite that it has episodes of.
 
     Raises:
         PublishedError: no such protocol, or it has none of this suite.
