@@ -16,7 +16,8 @@ from vecenv_eval.policies.simpler_grasps import choose
 from vecenv_eval.policies.simpler_reach import HANDS, Arm
 
 from vecenv.contract import Control, Part, PartJoint, PointCloud
-from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX, controller
+from vecenv.simpler.control.controllers import controller
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX
 from vecenv.simpler.control.rotations import rotation_from_rotvec
 from vecenv.simpler.control.servo import Servo, ServoConfig
 from vecenv.simpler.env import SimplerEnv, make

@@ -12,17 +12,8 @@ import pytest
 from support.simpler_files import GOOGLE_ROLLOUTS, WIDOWX_ROLLOUTS, rollouts, small_files
 
 from vecenv.simpler.control.chain import Chain, Clik, KinematicsError
-from vecenv.simpler.control.robots import (
-    GOOGLE_ROBOT,
-    ROBOTS,
-    WIDOWX,
-    Controller,
-    GoogleController,
-    Robot,
-    RobotError,
-    SetPoints,
-    WidowXController,
-)
+from vecenv.simpler.control.controllers import Controller, GoogleController, SetPoints, WidowXController
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, ROBOTS, WIDOWX, Robot, RobotError
 from vecenv.simpler.control.rotations import (
     quat_from_rotation,
     rotation_from_quat,

@@ -1,7 +1,7 @@
 """The SIMPLER environment: layouts, scenes, controllers and success criteria behind the verbs of ``vecenv.contract``.
 
 A batch of slots, each with one episode of one task of ``simpler/bridge`` (WidowX, 5 Hz) or ``simpler/google_robot``
-(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``control/robots.py`` for how an action becomes
+(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``control/controllers.py`` for how an action becomes
 set-points, ``physics/scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so
 actions of the whole batch become set-points in one call; scenes are stepped one by one, in worker processes.
 
@@ -27,7 +27,7 @@ from vecenv.controllers.waypoint import Plan
 from vecenv.simpler import snapshot
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.config import SimplerConfig, SimplerError
-from vecenv.simpler.control import robots
+from vecenv.simpler.control.controllers import controller
 from vecenv.simpler.control.servo import Servo, ServoConfig
 from vecenv.simpler.episodes import Episode, prepare, require_drawable
 from vecenv.simpler.following import PlanFollower
@@ -73,7 +73,7 @@ class SimplerEnv(SlotBatch):
         self.tasks = list_tasks(suite)
         self.robot = self.tasks[0].robot
         self._root = assets.simpler_root(config.assets)
-        self._controller = robots.controller(self.robot, self._root / self.robot.urdf_path(), self.num_envs)
+        self._controller = controller(self.robot, self._root / self.robot.urdf_path(), self.num_envs)
         self._servo = Servo(self._controller, config.servo or ServoConfig.of(self.robot))
         self._slots: Slots | None = make_slots(self._sizes(), self._num_workers())
         # Where objects of an episode came to rest; settling is the most expensive part of a reset.

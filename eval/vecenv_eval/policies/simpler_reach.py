@@ -15,7 +15,8 @@ from types import MappingProxyType
 import numpy as np
 
 from vecenv.simpler.control.chain import Chain, Clik
-from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX, Robot, controller
+from vecenv.simpler.control.controllers import controller
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX, Robot
 from vecenv.simpler.control.rotations import (
     quat_from_rotation,
     rotation_from_quat,

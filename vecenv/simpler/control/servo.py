@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.simpler.control.robots import WIDOWX, Controller, Robot
+from vecenv.simpler.control.controllers import Controller
+from vecenv.simpler.control.robots import WIDOWX, Robot
 from vecenv.simpler.control.rotations import (
     quat_from_rotation,
     rotation_from_quat,

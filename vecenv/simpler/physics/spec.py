@@ -16,8 +16,8 @@ import numpy as np
 # free fingers lag by 0.4 ms.
 GOOGLE_FINGER_ARMATURE = 0.003
 # Pressed on each other, the same fingers move the arm by 0.07 rad, where PhysX 4 has 0.00003. So they do not collide;
-# they stop where PhysX 4 stops them, when their joints add up to this (radians), also when one leads by 0.25 rad. Within
-# a margin of it (``scenes.py``) the drives' targets do not press on.
+# they stop where PhysX 4 stops them, when their joints add up to this (radians), also when one leads by 0.25 rad.
+# Within a margin of it (``scenes.py``) the drives' targets do not press on.
 GOOGLE_FINGER_STOP = 2.1496
 MAX_FINGERS = 4
 ROBOT, CABINET = "robot", "cabinet"

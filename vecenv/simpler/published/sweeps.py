@@ -14,16 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.simpler.layouts import (
-    DRAWER_STATIONS,
-    MOVE_NEAR_STATION,
-    PICK_STATION,
-    Station,
-    num_arrangements,
-    put_on_station,
-    stand,
-    unseeded_seeds,
-)
+from vecenv.simpler.layouts import num_arrangements, unseeded_seeds
 from vecenv.simpler.published.specs import (
     COKE_ENVIRONMENT,
     MOVE_NEAR_ENVIRONMENT,
@@ -33,6 +24,7 @@ from vecenv.simpler.published.specs import (
     EpisodeSpec,
     common_fields,
 )
+from vecenv.simpler.stations import DRAWER_STATIONS, MOVE_NEAR_STATION, PICK_STATION, Station, put_on_station, stand
 from vecenv.simpler.task_spec import SimplerTask
 
 # ---------------------------------------------------------------------------------------------------------------------
