@@ -586,7 +586,7 @@ def test_a_lifted_object_counts_until_the_grasp_is_lost() -> None:
 
 def replay(root: Path, name: str, seed: int) -> tuple[scenes.Scene, np.ndarray, object, preparing.Episode]:
     """A scene at the start of a recorded rollout, a row of facts, the robot's controller, and the episode."""
-    from vecenv.simpler.control import robots
+    from vecenv.simpler.control.controllers import controller
 
     task = TASKS[name]
     episode = preparing.prepare(task, episode_layout(task, seed), root)
@@ -594,7 +594,7 @@ def replay(root: Path, name: str, seed: int) -> tuple[scenes.Scene, np.ndarray, 
     scene.begin(episode.start)
     rows = np.zeros(1, spec.facts_dtype(task.robot.dof, len(episode.spec.objects)))
     scene.measure(rows[0])
-    control = robots.controller(task.robot, root / task.robot.urdf_path(), 1)
+    control = controller(task.robot, root / task.robot.urdf_path(), 1)
     control.reset(np.ones(1, bool), rows["qpos"])
     return scene, rows, control, episode
 
