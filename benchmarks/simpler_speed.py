@@ -15,7 +15,8 @@ from typing import Any
 import common
 import numpy as np
 
-from vecenv.simpler.env import SimplerEnv, make
+from vecenv import make
+from vecenv.simpler.env import SimplerEnv
 from vecenv.simpler.tasks import NUM_EPISODES, TASKS
 
 PAIR = ("widowx_carrot_on_plate", "google_robot_pick_coke_can")
@@ -45,7 +46,7 @@ def actions(slots: int, ticks: int = TICKS) -> np.ndarray:
 
 def running(task: str, slots: int, workers: int) -> SimplerEnv:
     episodes = [slot % NUM_EPISODES for slot in range(slots)]
-    env = make(TASKS[task].suite, task=task, episodes=episodes, num_workers=workers)
+    env = make(TASKS[task].suite, task=task, episodes=episodes, num_threads=workers)
     env.reset()
     env.step_continuous(np.zeros((slots, 7)))
     return env

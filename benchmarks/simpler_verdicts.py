@@ -22,8 +22,9 @@ import common
 import numpy as np
 from vecenv_eval.policies import make_policy
 
+from vecenv import make
 from vecenv.contract import Control
-from vecenv.simpler.env import SimplerEnv, make
+from vecenv.simpler.env import SimplerEnv
 from vecenv.simpler.layouts import episode_seed
 from vecenv.simpler.tasks import TASKS
 
@@ -111,7 +112,7 @@ json.dump(answers, open(sys.argv[2], 'w'))
 
 def record(task: str, episodes: int, kind: str) -> list[dict[str, Any]]:
     """Rollouts of a task: settled state, states and verdicts after every tick."""
-    env = make(TASKS[task].suite, task=task, episodes=range(episodes), num_workers=1)
+    env = make(TASKS[task].suite, task=task, episodes=range(episodes), num_threads=1)
     info = env.reset()
     rollouts = [
         {"seed": episode_seed(slot), "joints": env.robot.joints, "settled": state(env, slot), "states": [], "ours": []}

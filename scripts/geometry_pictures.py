@@ -22,7 +22,8 @@ import mujoco
 import numpy as np
 from vecenv_eval.policies import make_policy
 
-from vecenv.libero.env import SETTLE_ACTION, LiberoEnv, make
+from vecenv import make
+from vecenv.libero.env import SETTLE_ACTION, LiberoEnv
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import SceneKey
 from vecenv.libero.scene.lean import geometry, recipes

@@ -21,8 +21,11 @@ import sys
 from pathlib import Path, PurePosixPath
 
 from vecenv.simpler.assets import files as assets
+from vecenv.simpler.models import model_folder
 from vecenv.simpler.published.lists import ROOMS
-from vecenv.simpler.tasks import COKE_TABLE, DATA, PLAIN_TRIPLETS, TASKS, Stage, model_folder
+from vecenv.simpler.task_spec import DATA, StageSpec
+from vecenv.simpler.task_table import COKE_TABLE, PLAIN_TRIPLETS
+from vecenv.simpler.tasks import TASKS
 from vecenv.simpler.variants import DISTRACTORS, STAGES
 
 COMMIT = "ef7a4d4fdf4b69f2c2154db5b15b9ac8dfe10682"
@@ -64,7 +67,7 @@ def write(out: Path, commit: str, rows: list[dict[str, str | int]]) -> None:
 
 def variant_files(blobs: dict[str, str], tree: list[str]) -> list[str]:
     """Tables and rooms of variant aggregation, the mesh of one of its cabinets, and what its objects are drawn with."""
-    tables = [Stage(name=name, offset=COKE_TABLE.offset) for name in STAGES]
+    tables = [StageSpec(name=name, offset=COKE_TABLE.offset) for name in STAGES]
     meshes = [str(stage.mesh) for stage in (*tables, *ROOMS.values())]
     models = {*itertools.chain(*PLAIN_TRIPLETS, *DISTRACTORS.values())} - set(_MISSING_VISUALS)
     folders = tuple(f"{model_folder(model)}/" for model in models)

@@ -130,7 +130,7 @@ def test_vulkan_drivers_are_those_that_the_loader_finds(monkeypatch: pytest.Monk
 def test_simplers_tree_is_an_optional_check_that_counts_stand_ins(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    name = "assets: SIMPLER meshes, pictures and robots"
+    name = "assets: SIMPLER meshes, images and robots"
     monkeypatch.setenv("VECENV_SIMPLER_ASSETS", str(tmp_path / "none"))
     gone = found(doctor.diagnose(everything_answers), name)
     assert (gone.ok, gone.core) == (False, False)

@@ -117,7 +117,7 @@ def list_tasks(suite: str) -> tuple[TaskInfo, ...]:
     """The tasks of a suite in upstream's order, each with an ``index``, a ``name`` and an ``instruction``.
 
     Returns:
-        ``vecenv.libero.tasks.suites.TaskSpec`` or ``vecenv.simpler.tasks.SimplerTask``, by the suite.
+        ``vecenv.libero.tasks.suites.TaskSpec`` or ``vecenv.simpler.task_spec.SimplerTask``, by the suite.
 
     Raises:
         KeyError: a subclass that lists the suites there are.

@@ -402,7 +402,7 @@ def _asset_checks() -> list[Check]:
 
 def _simpler_asset_check() -> Check:
     """SIMPLER's tree, which only its own suites need, and how many of its files something plain stands in for."""
-    assets: Any = importlib.import_module(f"{DISTRIBUTION}.simpler.assets")
+    assets: Any = importlib.import_module(f"{DISTRIBUTION}.simpler.assets.files")
     row = assets.asset_row()
     check = _asset_check(row)
     notes = assets.stand_ins(row.path) if row.ok else ()

@@ -15,11 +15,13 @@ from vecenv_eval.policies import simpler_drawers as drawers
 from vecenv_eval.policies.simpler_grasps import choose
 from vecenv_eval.policies.simpler_reach import HANDS, Arm
 
+from vecenv import make
 from vecenv.contract import Control, Part, PartJoint, PointCloud
-from vecenv.simpler.control.kinematics import rotation_from_rotvec
-from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX, controller
+from vecenv.simpler.control.controllers import controller
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX
+from vecenv.simpler.control.rotations import rotation_from_rotvec
 from vecenv.simpler.control.servo import Servo, ServoConfig
-from vecenv.simpler.env import SimplerEnv, make
+from vecenv.simpler.env import SimplerEnv
 from vecenv.simpler.tasks import TASKS
 
 QPOS = np.array([-0.01840777, 0.0398835, 0.22242722, -0.00460194, 1.36524296, 0.00153398, 0.037, 0.037])
@@ -45,7 +47,7 @@ def box_cloud(half: tuple[float, float, float], centre: tuple[float, float, floa
 
 def solved(root: Path, task: str, episodes: int) -> np.ndarray:
     """Which episodes of a task the policy solves."""
-    env = make(TASKS[task].suite, task=task, episodes=range(episodes), assets=root, num_workers=1)
+    env = make(TASKS[task].suite, task=task, episodes=range(episodes), assets=root, num_threads=1)
     policy, info = make_policy("simpler_scripted"), env.reset()
     policy.reset(env, info)
     done = np.zeros(episodes, bool)

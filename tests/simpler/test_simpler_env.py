@@ -18,17 +18,20 @@ import pytest
 from support.simpler_files import GOOGLE_ROLLOUTS, SEEDS, WIDOWX_ROLLOUTS, rollouts
 
 from vecenv.contract import ImagesUnavailable, State
-from vecenv.simpler.control.kinematics import rotation_from_quat
+from vecenv.simpler.control.rotations import rotation_from_quat
 from vecenv.simpler.layouts import episode_layout
-from vecenv.simpler.tasks import BRIDGE, GOOGLE, TASKS, find_task, list_tasks
+from vecenv.simpler.task_spec import BRIDGE, GOOGLE
+from vecenv.simpler.tasks import TASKS, find_task, list_tasks
 
 pytest.importorskip("sapien")
 pytest.importorskip("ruckig")
 
+from vecenv import make
 from vecenv.simpler import episodes as preparing
 from vecenv.simpler import judge as judging
-from vecenv.simpler.env import SimplerEnv, SimplerError, make
-from vecenv.simpler.physics import hulls, scenes, workers
+from vecenv.simpler import workers
+from vecenv.simpler.env import SimplerEnv, SimplerError
+from vecenv.simpler.physics import hulls, scenes, spec
 
 CARROT, OPEN_TOP, COKE = "widowx_carrot_on_plate", "google_robot_open_top_drawer", "google_robot_pick_coke_can"
 PLACE = "google_robot_place_apple_in_closed_top_drawer"
@@ -48,7 +51,7 @@ def carrot(small: Path) -> Iterator[SimplerEnv]:
 
 
 def batch(root: Path, task: str, episodes, **options) -> SimplerEnv:
-    env = make(TASKS[task].suite, task=task, episodes=episodes, assets=root, num_workers=1, **options)
+    env = make(TASKS[task].suite, task=task, episodes=episodes, assets=root, num_threads=1, **options)
     env.reset()
     return env
 
@@ -73,7 +76,7 @@ def objects(env: SimplerEnv, slot: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize(("suite", "width"), [(BRIDGE, 23), (GOOGLE, 29)])
 def test_every_task_of_a_suite_runs_in_one_batch(tree: Path, suite: str, width: int) -> None:
-    env = make(suite, episodes=[3], assets=tree, num_workers=1)
+    env = make(suite, episodes=[3], assets=tree, num_threads=1)
     info = env.reset()
     control = env.step_continuous(np.tile(STAY, (env.num_envs, 1)))
     names = [task.name for task in list_tasks(suite)]
@@ -122,7 +125,7 @@ def test_missing_stages_are_named(carrot: SimplerEnv) -> None:
 def test_no_renderer_torch_or_maniskill_is_loaded(small: Path) -> None:
     program = (
         "import sys; from vecenv.simpler.env import make\n"
-        f"env = make('simpler/bridge', task='{CARROT}', episodes=[0], num_workers=1); env.reset(); env.close()\n"
+        f"env = make('simpler/bridge', task='{CARROT}', episodes=[0], num_threads=1); env.reset(); env.close()\n"
         "print([name for name in ('torch', 'mani_skill') if name in sys.modules])"
     )
     environment = {**os.environ, "VECENV_SIMPLER_ASSETS": str(small)}
@@ -199,7 +202,7 @@ def test_a_broken_slot_is_quarantined_alone(carrot: SimplerEnv, monkeypatch: pyt
 
 
 def test_steps_before_reset_and_after_close_are_refused(small: Path) -> None:
-    env = make(BRIDGE, task=CARROT, episodes=[0], assets=small, num_workers=1)
+    env = make(BRIDGE, task=CARROT, episodes=[0], assets=small, num_threads=1)
     with pytest.raises(SimplerError, match="reset"):
         env.step_continuous(np.zeros((1, 7)))
     env.close()
@@ -264,7 +267,7 @@ def test_a_missing_driver_is_named(carrot: SimplerEnv) -> None:
 def test_every_task_is_drawn_on_its_photograph(small: Path, suite: str) -> None:
     if not drawable():
         pytest.skip("no Vulkan driver")
-    env = make(suite, episodes=[0], assets=small, num_workers=1)
+    env = make(suite, episodes=[0], assets=small, num_threads=1)
     env.reset()
     seen = env.observe_egocentric()
     camera = env.tasks[0].camera
@@ -284,7 +287,7 @@ def test_a_driver_missing_in_workers_is_named_and_physics_goes_on(small: Path, m
 
     for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
         monkeypatch.setenv(name, str(small / "no_such_driver.json"))
-    env = make(BRIDGE, task=CARROT, episodes=range(2), assets=small, num_workers=2)
+    env = make(BRIDGE, task=CARROT, episodes=range(2), assets=small, num_threads=2)
     env.reset()
     for _ in range(2):
         with pytest.raises(RendererMissing, match="mesa-vulkan-drivers"):
@@ -299,7 +302,7 @@ def test_worker_processes_draw_what_one_process_draws(small: Path) -> None:
         pytest.skip("no Vulkan driver")
     pictures = []
     for count in (1, 2):
-        env = make(BRIDGE, task=CARROT, episodes=range(3), assets=small, num_workers=count)
+        env = make(BRIDGE, task=CARROT, episodes=range(3), assets=small, num_threads=count)
         env.reset()
         env._fault[1] = "bad"
         before = env.observe_egocentric()
@@ -352,7 +355,7 @@ def test_worker_processes_do_what_one_process_does(small: Path) -> None:
     actions = np.random.RandomState(0).uniform(-1, 1, (3, 4, 7)) * [0.02, 0.02, 0.02, 0.1, 0.1, 0.1, 1.0]
     ends = []
     for count in (1, 2):
-        env = make(BRIDGE, task=CARROT, episodes=range(3), assets=small, num_workers=count)
+        env = make(BRIDGE, task=CARROT, episodes=range(3), assets=small, num_threads=count)
         env.reset()
         env.step_continuous(actions)
         ends.append(env.state().qpos)
@@ -361,7 +364,7 @@ def test_worker_processes_do_what_one_process_does(small: Path) -> None:
 
 
 def test_a_failing_worker_says_why(small: Path) -> None:
-    env = make(BRIDGE, task=CARROT, episodes=range(2), assets=small, num_workers=2)
+    env = make(BRIDGE, task=CARROT, episodes=range(2), assets=small, num_threads=2)
     job = env._job(0)
     robot = dataclasses.replace(job.spec.robot, joints=())
     bad = dataclasses.replace(job, spec=dataclasses.replace(job.spec, robot=robot))
@@ -391,13 +394,13 @@ def test_google_robot_opens_and_closes(tree: Path, gripper: str, opening: float,
     fingers = env.observe_egocentric().state[:, 7:9]
     np.testing.assert_allclose(fingers[0], 0.0, atol=2e-3)
     # Closed fingers stop at each other.
-    np.testing.assert_allclose(fingers[1], scenes.GOOGLE_FINGER_STOP / 2, atol=5e-3)
+    np.testing.assert_allclose(fingers[1], spec.GOOGLE_FINGER_STOP / 2, atol=5e-3)
     env.close()
 
 
 @pytest.mark.parametrize(("variant", "tilt"), [(None, 0.785), ({"camera": "lower"}, 0.935)])
 def test_the_head_stays_where_the_episode_has_it(small: Path, variant: dict[str, str] | None, tilt: float) -> None:
-    env = make("simpler/google_robot", task=COKE, episodes=[0], assets=small, num_workers=1, variant=variant)
+    env = make("simpler/google_robot", task=COKE, episodes=[0], assets=small, num_threads=1, variant=variant)
     env.reset()
     before = env.observe_egocentric().state[0, 9:11]
     env.step_continuous(np.tile([0.02, 0.02, -0.03, 0.1, 0.2, 0.3, 1.0], (1, 5, 1)))
@@ -564,7 +567,7 @@ def test_the_second_half_begins_by_itself(small: Path) -> None:
 
 def test_a_lifted_object_counts_until_the_grasp_is_lost() -> None:
     task = find_task(GOOGLE, COKE)
-    rows = np.zeros(1, scenes.facts_dtype(11, 1))
+    rows = np.zeros(1, spec.facts_dtype(11, 1))
     rows["objects"][0, 0, 3] = 1.0
     roles = judging.Roles(source=0, loose=(0,), sizes=np.ones((1, 3)))
     judge = judging.Judge(task, roles, rows[0])
@@ -584,15 +587,15 @@ def test_a_lifted_object_counts_until_the_grasp_is_lost() -> None:
 
 def replay(root: Path, name: str, seed: int) -> tuple[scenes.Scene, np.ndarray, object, preparing.Episode]:
     """A scene at the start of a recorded rollout, a row of facts, the robot's controller, and the episode."""
-    from vecenv.simpler.control import robots
+    from vecenv.simpler.control.controllers import controller
 
     task = TASKS[name]
     episode = preparing.prepare(task, episode_layout(task, seed), root)
     scene = scenes.Scene(episode.spec)
     scene.begin(episode.start)
-    rows = np.zeros(1, scenes.facts_dtype(task.robot.dof, len(episode.spec.objects)))
+    rows = np.zeros(1, spec.facts_dtype(task.robot.dof, len(episode.spec.objects)))
     scene.measure(rows[0])
-    control = robots.controller(task.robot, root / task.robot.urdf_path(), 1)
+    control = controller(task.robot, root / task.robot.urdf_path(), 1)
     control.reset(np.ones(1, bool), rows["qpos"])
     return scene, rows, control, episode
 

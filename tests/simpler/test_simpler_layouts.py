@@ -17,7 +17,6 @@ import pytest
 from support.paths import DATA
 from support.simpler_files import GOOGLE_ROLLOUTS, WIDOWX_ROLLOUTS, rollouts, small_files
 
-from vecenv.simpler import tasks
 from vecenv.simpler.control.robots import ROBOTS
 from vecenv.simpler.layouts import (
     DROP_HEIGHT,
@@ -28,19 +27,11 @@ from vecenv.simpler.layouts import (
     object_words,
     unseeded_seeds,
 )
-from vecenv.simpler.tasks import (
-    PLACE_MODELS,
-    SUITES,
-    TASKS,
-    DrawerSuccess,
-    ModelDataError,
-    UnknownSuite,
-    UnknownTask,
-    eval_metadata,
-    find_task,
-    list_tasks,
-    read_models,
-)
+from vecenv.simpler.models import ModelDataError, read_models
+from vecenv.simpler.published.metadata import eval_metadata
+from vecenv.simpler.task_spec import DrawerSuccess, SimplerTask
+from vecenv.simpler.task_table import PLACE_MODELS
+from vecenv.simpler.tasks import SUITES, TASKS, UnknownSuite, UnknownTask, find_task, list_tasks
 
 UPSTREAM: dict[str, Any] = json.loads((DATA / "simpler_layouts_upstream.json").read_text())
 
@@ -94,7 +85,7 @@ def test_episodes_are_counted() -> None:
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=list(TASKS))
-def test_control_steps_are_whole_numbers_of_substeps(task: tasks.SimplerTask) -> None:
+def test_control_steps_are_whole_numbers_of_substeps(task: SimplerTask) -> None:
     assert task.sim_hz == task.control_hz * task.robot.substeps
     assert task.robot is ROBOTS[task.robot.name]
 

@@ -21,8 +21,10 @@ from typer.testing import CliRunner
 
 from vecenv.assets import AssetsMissing
 from vecenv.placement import PlacementError
-from vecenv.simpler.assets.files import VARIANTS_MANIFEST, assets_app, how_to_get, read_manifest
+from vecenv.simpler.assets.files import VARIANTS_MANIFEST, how_to_get, read_manifest
+from vecenv.simpler.cli import assets_app
 from vecenv.simpler.layouts import LayoutError, episode_layout, episode_seed, lay_out
+from vecenv.simpler.models import model_folder
 from vecenv.simpler.published import lists as published
 from vecenv.simpler.published.lists import (
     PROTOCOLS,
@@ -33,7 +35,9 @@ from vecenv.simpler.published.lists import (
     place,
     scene_of,
 )
-from vecenv.simpler.tasks import BRIDGE, DATA, GOOGLE, TASKS, UnknownTask, eval_metadata, model_folder
+from vecenv.simpler.published.metadata import eval_metadata
+from vecenv.simpler.task_spec import BRIDGE, DATA, GOOGLE
+from vecenv.simpler.tasks import TASKS, UnknownTask
 
 if TYPE_CHECKING:
     from vecenv.simpler.env import SimplerEnv
@@ -304,11 +308,11 @@ def test_the_command_pulls_variants_alone(tmp_path: Path) -> None:
 
 def made(root: Path, protocol: str, task: Any, rows: Any, **options: Any) -> SimplerEnv:
     pytest.importorskip("sapien")
-    from vecenv.simpler.env import make
+    from vecenv import make
 
     tasks = [task] if isinstance(task, str) else task
     suite = TASKS[tasks[0]].suite
-    return make(suite, tasks=tasks, protocol=protocol, episodes=rows, assets=root, num_workers=1, **options)
+    return make(suite, tasks=tasks, protocol=protocol, episodes=rows, assets=root, num_threads=1, **options)
 
 
 def batch(root: Path, protocol: str, task: str, rows: Sequence[int]) -> SimplerEnv:

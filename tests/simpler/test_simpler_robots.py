@@ -11,28 +11,17 @@ import numpy as np
 import pytest
 from support.simpler_files import GOOGLE_ROLLOUTS, WIDOWX_ROLLOUTS, rollouts, small_files
 
-from vecenv.simpler.control.kinematics import (
-    Chain,
-    Clik,
-    KinematicsError,
+from vecenv.simpler.control.chain import Chain, Clik, KinematicsError
+from vecenv.simpler.control.controllers import Controller, GoogleController, SetPoints, WidowXController
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, ROBOTS, WIDOWX, Robot, RobotError
+from vecenv.simpler.control.rotations import (
     quat_from_rotation,
-    read_urdf,
     rotation_from_quat,
     rotation_from_rotvec,
     rotation_from_rpy,
     rotvec_from_rotation,
 )
-from vecenv.simpler.control.robots import (
-    GOOGLE_ROBOT,
-    ROBOTS,
-    WIDOWX,
-    Controller,
-    GoogleController,
-    Robot,
-    RobotError,
-    SetPoints,
-    WidowXController,
-)
+from vecenv.simpler.control.urdf import read_urdf
 
 ROLLOUTS = {WIDOWX.name: WIDOWX_ROLLOUTS, GOOGLE_ROBOT.name: GOOGLE_ROLLOUTS}
 EVERYONE = np.ones(2, bool)

@@ -13,7 +13,8 @@ from support import simpler_assets_small
 import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.simpler.layouts import episode_layout, episode_seed
-from vecenv.simpler.tasks import TASKS, Lighting
+from vecenv.simpler.task_spec import Lighting
+from vecenv.simpler.tasks import TASKS
 from vecenv.simpler.variants import DISTRACTORS, STATIONS, Variant, VariantError, varied
 
 COKE, NEAR, OPEN = "google_robot_pick_coke_can", "google_robot_move_near", "google_robot_open_top_drawer"
@@ -78,9 +79,9 @@ def test_move_near_can_do_without_its_third_object() -> None:
         (
             COKE,
             {"lighting": "room"},
-            "lighting='room' is not there for google_robot_pick_coke_can; expected one of bri",
+            "lighting='room' is not available for google_robot_pick_coke_can; expected one of bri",
         ),
-        (COKE, {"station": "mk_station2"}, "station='mk_station2' is not there for .*; expected none at all"),
+        (COKE, {"station": "mk_station2"}, "station='mk_station2' is not available for .*; expected none at all"),
         (OPEN, {"stage": "modern_bedroom_no_roof"}, "stage='modern_bedroom_no_roof' is not there"),
         (OPEN, {"distractors": "less"}, "distractors='less' is not there"),
         (NEAR, {"distractors": "more"}, "expected one of none"),

@@ -16,7 +16,9 @@ import numpy as np
 from PIL import Image
 
 from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX
-from vecenv.simpler.tasks import DATA, PLAIN_MODELS_FILE, PLAIN_TRIPLETS, TASKS
+from vecenv.simpler.task_spec import DATA
+from vecenv.simpler.task_table import PLAIN_MODELS_FILE, PLAIN_TRIPLETS
+from vecenv.simpler.tasks import TASKS
 
 _Vector = tuple[float, float, float]
 # Half sizes of objects that must not be cubes, metres.

@@ -2,6 +2,6 @@
 
 import warnings
 
-# SAPIEN says so whenever it is imported, in every worker process; physics needs no Vulkan, and pictures name what is
-# missing when they are asked for.
+# SAPIEN warns whenever it is imported, in every worker process. Physics needs no Vulkan, and rendering raises
+# RendererMissing where it is missing.
 warnings.filterwarnings("ignore", message="Failed to find system libvulkan", category=UserWarning)

@@ -1,9 +1,9 @@
 """The SIMPLER environment: layouts, scenes, controllers and success criteria behind the verbs of ``vecenv.contract``.
 
 A batch of slots, each with one episode of one task of ``simpler/bridge`` (WidowX, 5 Hz) or ``simpler/google_robot``
-(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``robots.py`` for what becomes of an action,
-``scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so actions of the whole
-batch become set-points in one call; scenes are stepped one by one, spread over worker processes.
+(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``control/controllers.py`` for how an action becomes
+set-points, ``physics/scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so
+actions of the whole batch become set-points in one call; scenes are stepped one by one, in worker processes.
 
 An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in the axes of the robot's base;
 ``vecenv/actions.py`` has the table of conventions.
@@ -12,36 +12,35 @@ An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
-from vecenv.contract import CameraView, Control, Egocentric, Objects, Rendered, State
+from vecenv.contract import Control, Egocentric, Objects, Rendered, State
 from vecenv.controllers.waypoint import WaypointPlan
+from vecenv.simpler import snapshot
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.config import SimplerConfig, SimplerError
-from vecenv.simpler.control import kinematics, robots
-from vecenv.simpler.control.kinematics import rotation_from_quat
+from vecenv.simpler.control.controllers import controller
 from vecenv.simpler.control.servo import Servo, ServoConfig
 from vecenv.simpler.episodes import Episode, prepare, require_drawable
+from vecenv.simpler.following import PlanFollower
 from vecenv.simpler.judge import Judge, Verdict
-from vecenv.simpler.physics.scenes import instances
-from vecenv.simpler.physics.workers import Job, Sizes, Slots, make_slots
+from vecenv.simpler.observe import CameraPoses, LazyImages, SimplerEgocentric, SlotFacts
+from vecenv.simpler.overlay import ImageBuffer, Images, RenderStyle, RenderSubject
+from vecenv.simpler.physics.spec import instances
 from vecenv.simpler.published.lists import EpisodeSpec, check_placement, counts, place, scene_of
 from vecenv.simpler.published.lists import episodes as published_episodes
 from vecenv.simpler.tasks import find_task, list_tasks
 from vecenv.simpler.variants import varied
+from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
-if TYPE_CHECKING:
-    from vecenv.simpler.overlay import Pictures
-
-# Slot -> its episode and a row of facts.
-_Shown: TypeAlias = dict[int, tuple[Episode, np.void]]
 # Largest action: metres, radians, gripper.
 ACTION_LIMITS = np.array([1.0, 1.0, 1.0, np.pi / 2, np.pi / 2, np.pi / 2, 1.0])
 # LIBERO's name for the third-person camera.
@@ -53,8 +52,8 @@ _MAX_OBJECTS = 8
 class SimplerEnv(SlotBatch):
     """A batch of SIMPLER episodes; see ``vecenv.make``.
 
-    ``step_ee_pose`` moves as fast as ``config.servo`` lets it, and where it holds, it holds still where the last call
-    led. Its poses are those of the tool (WidowX ``ee_gripper_link``, Google Robot ``link_gripper_tcp``).
+    ``step_ee_pose`` moves as fast as ``config.servo`` allows; where it holds, it keeps the pose that the last call
+    led to. Its poses are those of the tool (WidowX ``ee_gripper_link``, Google Robot ``link_gripper_tcp``).
 
     Args:
         suite: ``simpler/bridge`` or ``simpler/google_robot``.
@@ -73,13 +72,13 @@ class SimplerEnv(SlotBatch):
         self.tasks = list_tasks(suite)
         self.robot = self.tasks[0].robot
         self._root = assets.simpler_root(config.assets)
-        self._controller = robots.controller(self.robot, self._root / self.robot.urdf_path(), self.num_envs)
+        self._controller = controller(self.robot, self._root / self.robot.urdf_path(), self.num_envs)
         self._servo = Servo(self._controller, config.servo or ServoConfig.of(self.robot))
         self._slots: Slots | None = make_slots(self._sizes(), self._num_workers())
-        # Where objects of an episode came to rest; settling is the dearest part of a reset.
+        # Where objects of an episode came to rest; settling is the most expensive part of a reset.
         self._settled: dict[tuple[int, int], np.ndarray] = {}
         self._prepared: dict[tuple[int, int], Episode] = {}
-        self._chains: dict[str, kinematics.Chain] = {}
+        self._camera_poses = CameraPoses(self.robot, self._root)
         self._place(placement)
 
     def _sizes(self) -> Sizes:
@@ -119,7 +118,7 @@ class SimplerEnv(SlotBatch):
 
     @property
     def specs(self) -> tuple[EpisodeSpec, ...]:
-        """For each slot, what its list says of the episode; ``config.variant`` comes on top."""
+        """For each slot, its episode's row in the published list; ``config.variant`` is applied on top."""
         return tuple(self._spec(*self._key(slot)) for slot in range(self.num_envs))
 
     def _instruction(self, slot: int) -> str:
@@ -130,8 +129,8 @@ class SimplerEnv(SlotBatch):
     def _label(self, task: int) -> str:
         return self.tasks[task].name
 
-    def advance_subtask(self, slots: Any = None) -> None:
-        """Tell slots (bool [B], all by default) of tasks in two halves that the first half is done."""
+    def advance_subtask(self, slots: npt.ArrayLike | None = None) -> None:
+        """Begin the second half in slots (bool [B], all by default) of tasks that have two."""
         chosen = np.ones(self.num_envs, bool) if slots is None else np.asarray(slots, bool)
         for slot in np.flatnonzero(chosen):
             judge = self._judges[slot]
@@ -169,7 +168,7 @@ class SimplerEnv(SlotBatch):
 
     # -- stepping ------------------------------------------------------------------------------------------------------
 
-    def step_continuous(self, actions: Any) -> Control:
+    def step_continuous(self, actions: npt.ArrayLike) -> Control:
         """Advance by one control tick, or by a chunk of K.
 
         Args:
@@ -215,7 +214,7 @@ class SimplerEnv(SlotBatch):
     def _failures(self) -> Mapping[int, str]:
         return {slot: reason for slot, reason in enumerate(self.slots.faults) if reason}
 
-    def _diagnostics(self) -> dict[str, Any]:
+    def _diagnostics(self) -> dict[str, object]:
         return {"parts": tuple(verdict.parts for verdict in self._verdicts), "stand_ins": self.stand_ins}
 
     def _tools(self) -> np.ndarray:
@@ -236,13 +235,14 @@ class SimplerEnv(SlotBatch):
         return reward, arrived
 
     def _follow(self, plan: WaypointPlan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        followed = _Followed(self, plan, max_misses)
-        return followed.run(), followed.converged, followed.ticks
+        follower = PlanFollower(self._servo, plan, max_misses)
+        reward = follower.run(self._tick, lambda: self._facts, lambda: self.done)
+        return reward, follower.converged, follower.ticks
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
     def observe_egocentric(self) -> Egocentric:
-        """What every slot's camera sees now, and its joints; pictures are drawn when they are first read.
+        """What every slot's camera sees now, and its joints; images are rendered when they are first read.
 
         ``state`` is qpos, qvel and base pose (xyz, wxyz), float32 [B, 23] or [B, 29]. The only camera is the
         third-person one, 480 x 640 or 512 x 640; ``wrist_image`` is None. A slot whose physics failed shows black.
@@ -251,47 +251,23 @@ class SimplerEnv(SlotBatch):
         facts = self._facts.copy()
         state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
         healthy = [slot for slot, fault in enumerate(self._fault) if not fault]
-        seen = _Seen(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
+        images = LazyImages(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
+        cameras = [episode.task.camera for episode in self._episodes]
         return SimplerEgocentric(
             state=state.astype(np.float32),
-            images=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("rgb")}),
-            depths=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("depth")}),
-            segmentations=Rendered([_CAMERA], lambda _: {_CAMERA: seen.of("segmentation")}),
-            views={_CAMERA: self._view(facts)},
+            images=Rendered([_CAMERA], lambda _: {_CAMERA: images.read("rgb")}),
+            depths=Rendered([_CAMERA], lambda _: {_CAMERA: images.read("depth")}),
+            segmentations=Rendered([_CAMERA], lambda _: {_CAMERA: images.read("segmentation")}),
+            views={_CAMERA: self._camera_poses.view(cameras, facts)},
             instances=tuple(instances(episode.spec) for episode in self._episodes),
         )
 
-    def _draw(self, shown: _Shown, deep: bool) -> Pictures:
-        from vecenv.simpler.overlay import Canvas, Style, Subject
-
+    def _draw(self, slots: SlotFacts, deep: bool) -> Images:
         camera = self._episodes[0].task.camera
-        style = Style(overlay=self.config.overlay, shadows=self.config.shadows)
-        canvas = Canvas(slots=self.num_envs, height=camera.height, width=camera.width, deep=deep)
-        orders = {slot: (Subject.of(episode, self._root), facts) for slot, (episode, facts) in shown.items()}
-        return self.slots.draw(style, canvas, orders)
-
-    def _view(self, facts: np.ndarray) -> CameraView:
-        cameras = [episode.task.camera for episode in self._episodes]
-        mounts = {camera.link: self._mounts(camera.link, facts) for camera in cameras}
-        mount = np.stack([mounts[camera.link][slot] for slot, camera in enumerate(cameras)])
-        local = rotation_from_quat(np.array([camera.quat for camera in cameras]))
-        turn = rotation_from_quat(mount[:, 3:])
-        position = mount[:, :3] + np.einsum("nij,nj->ni", turn, np.array([camera.position for camera in cameras]))
-        # SAPIEN's cameras look along x with z up; columns here are right, down and forward.
-        mat = (turn @ local) @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-        return CameraView(intrinsics=np.stack([camera.intrinsics for camera in cameras]), pos=position, mat=mat)
-
-    def _mounts(self, link: str, facts: np.ndarray) -> np.ndarray:
-        """World poses of a link, [B, 7]."""
-        if link == self.robot.root:
-            return facts["base"]
-        if link not in self._chains:
-            urdf = kinematics.read_urdf(self._root / self.robot.urdf_path())
-            self._chains[link] = urdf.chain(link, self.robot.joints)
-        position, rotation = self._chains[link].pose(facts["qpos"])
-        turn = rotation_from_quat(facts["base"][:, 3:])
-        world = facts["base"][:, :3] + np.einsum("nij,nj->ni", turn, position)
-        return np.concatenate([world, kinematics.quat_from_rotation(turn @ rotation)], axis=1)
+        style = RenderStyle(overlay=self.config.overlay, shadows=self.config.shadows)
+        buffer = ImageBuffer(slots=self.num_envs, height=camera.height, width=camera.width, deep=deep)
+        subjects = {slot: (RenderSubject.of(episode, self._root), facts) for slot, (episode, facts) in slots.items()}
+        return self.slots.draw(style, buffer, subjects)
 
     def observe_objects(self, points: str = "surface") -> Objects:
         """Ground truth of every slot.
@@ -302,8 +278,6 @@ class SimplerEnv(SlotBatch):
         Raises:
             SimplerError: another value.
         """
-        from vecenv.simpler import snapshot
-
         self._check_live()
         if points not in ("surface", "aabb"):
             raise SimplerError(f"points={points!r}: expected 'surface' or 'aabb'")
@@ -317,7 +291,7 @@ class SimplerEnv(SlotBatch):
 
     @property
     def stand_ins(self) -> tuple[tuple[str, ...], ...]:
-        """For each slot, what files are missing and what stands in for them."""
+        """For each slot, notes about missing files and what stands in for them."""
         return tuple(episode.notes for episode in self._episodes)
 
     # -- physics state -------------------------------------------------------------------------------------------------
@@ -388,86 +362,6 @@ class SimplerEnv(SlotBatch):
         poses, speeds = qpos[joints : joints + 7 * count], qvel[joints : joints + 6 * count]
         things = np.concatenate([poses.reshape(-1, 7), speeds.reshape(-1, 6)], axis=1)
         return np.concatenate([qpos[:dof], qvel[:dof], qpos[dof:joints], qvel[dof:joints], things.ravel()])
-
-
-@dataclass(frozen=True)
-class SimplerEgocentric(Egocentric):
-    """An observation with the third-person camera only."""
-
-    @property
-    def wrist_image(self) -> None:  # type: ignore[override]
-        """Always None: there is no wrist camera."""
-        return None
-
-    @property
-    def observation(self) -> list[np.ndarray]:
-        """The third-person camera's image alone."""
-        return [self.rgb]
-
-
-class _Seen:
-    """Pictures of all slots at one moment, drawn when the first of them is asked for; again when depth is missing."""
-
-    def __init__(self, draw: Callable[[_Shown, bool], Pictures], shown: _Shown) -> None:
-        self._draw, self._shown = draw, shown
-        self._pictures: Pictures | None = None
-
-    def of(self, field: str) -> np.ndarray:
-        """One field of the pictures; zeros where nothing was drawn."""
-        if self._pictures is None or getattr(self._pictures, field) is None:
-            self._pictures = self._draw(self._shown, field == "depth")
-        return getattr(self._pictures, field)
-
-
-class _Followed:
-    """A plan being followed: every slot is at its own waypoint."""
-
-    def __init__(self, env: SimplerEnv, plan: Any, max_misses: int | None) -> None:
-        self._env, self._max_misses = env, max_misses
-        self._targets = np.concatenate([plan.pose.pos, plan.pose.quat, np.asarray(plan.grip)[..., None]], axis=-1)
-        self._hold, self._valid = np.asarray(plan.hold), np.asarray(plan.valid)
-        self.converged = np.zeros(self._valid.shape, bool)
-        self.ticks = np.zeros(self._valid.shape, int)
-        b = len(self._valid)
-        self._at, self._misses = np.zeros(b, int), np.zeros(b, int)
-        self._rows = np.arange(b)
-
-    def run(self) -> np.ndarray:
-        """Follow it to the end; returns the rewards [B]."""
-        env, length = self._env, self._valid.shape[1]
-        servo, reward = env._servo, np.zeros(env.num_envs)
-        servo.begin(env._facts["tcp"])
-        self._skip()
-        while (going := (self._at < length) & ~env.done & self._patient()).any():
-            here = np.minimum(self._at, length - 1)
-            targets, driving = self._targets[self._rows, here], self._hold[self._rows, here] == 0
-            reward += env._tick(servo.actions(targets, driving & going, env._facts), going)
-            self.ticks[self._rows[going], here[going]] += 1
-            self._leave(going, here, targets, driving)
-        return reward
-
-    def _patient(self) -> np.ndarray:
-        return self._misses < self._max_misses if self._max_misses is not None else np.ones(len(self._at), bool)
-
-    def _leave(self, going: np.ndarray, here: np.ndarray, targets: np.ndarray, driving: np.ndarray) -> None:
-        env, rows = self._env, self._rows
-        arrived = env._servo.arrived(targets, env._facts["tcp"])
-        limit = np.where(driving, env._servo.config.max_steps, self._hold[rows, here])
-        stuck = env._servo.stuck(targets, env._facts["tcp"], driving & going)
-        spent = stuck | (self.ticks[rows, here] >= limit)
-        leaving = going & ((driving & arrived) | spent)
-        self.converged[rows[leaving], here[leaving]] = arrived[leaving]
-        missed = leaving & driving & ~arrived
-        self._misses = np.where(missed, self._misses + 1, np.where(leaving & driving, 0, self._misses))
-        self._at += leaving
-        self._skip()
-
-    def _skip(self) -> None:
-        """Go past waypoints that are not valid."""
-        length = self._valid.shape[1]
-        for row in self._rows:
-            while self._at[row] < length and not self._valid[row, self._at[row]]:
-                self._at[row] += 1
 
 
 def task_indices(suite: str, tasks: Any) -> Any:

@@ -1,7 +1,7 @@
-"""From an episode's layout to what physics needs: the scene, the start, and who is who.
+"""From an episode's layout to what physics needs: the scene, the start, and the objects' roles.
 
 In: a ``Layout`` (``layouts.py``) and the asset tree. Out: ``Episode``: a ``SceneSpec`` that equal episodes share, a
-``Start``, the ``Roles`` that judging needs, and a note for every file that something plain stands in for.
+``Start``, the ``Roles`` that judging needs, and a note for every file that a plain shape stands in for.
 """
 
 from __future__ import annotations
@@ -17,20 +17,21 @@ from vecenv.simpler.assets import files as assets
 from vecenv.simpler.control.robots import GOOGLE_ROBOT, LinkMaterial, Robot
 from vecenv.simpler.judge import Roles
 from vecenv.simpler.layouts import Layout, Placed
-from vecenv.simpler.physics.scenes import (
+from vecenv.simpler.models import ModelInfo, read_models
+from vecenv.simpler.physics.spec import (
     GOOGLE_FINGER_ARMATURE,
     GOOGLE_FINGER_STOP,
     Box,
-    Cabinet,
-    Finger,
+    CabinetBody,
+    FingerLink,
+    LinkSurface,
     ObjectBody,
     RobotBody,
     SceneSpec,
-    Stage,
+    StageBody,
     Start,
 )
-from vecenv.simpler.physics.weld import LinkSurface
-from vecenv.simpler.tasks import BRIDGE, DRAWERS, ModelInfo, SimplerTask, read_models
+from vecenv.simpler.task_spec import BRIDGE, DRAWERS, SimplerTask
 from vecenv.simpler.variants import station_meshes
 
 # The cabinet's place in the world.
@@ -51,9 +52,9 @@ class Episode:
 
     Attributes:
         task: its task. layout: where everything is.
-        spec: the scene. start: where it begins. roles: who is who.
+        spec: the scene. start: where it begins. roles: of the objects.
         notes: what is missing and what stands in for it.
-        undrawn: missing files that physics does without but pictures need: path in the asset tree, and what it is.
+        undrawn: missing files that only rendering needs: path in the asset tree, and what it is.
     """
 
     task: SimplerTask
@@ -79,13 +80,13 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
     models = read_models(root / task.models_path) if task.models_path else {}
     notes: list[str] = []
     spec = SceneSpec(
-        # The robot's versions differ in colour only, so scenes without pictures share the plain one.
+        # The robot's versions differ in colour only, so physics scenes share the plain one.
         robot=robot_body(task.robot, root / task.robot.urdf_path(), layout.qpos),
         sim_hz=task.sim_hz,
         contact_offset=task.contact_offset,
         objects=tuple(_body(placed, models, root, notes) for placed in layout.objects),
         stage=_stage(task, root, notes),
-        cabinet=Cabinet(urdf=root / task.station, drawers=DRAWERS, pose=CABINET_POSE) if task.station else None,
+        cabinet=CabinetBody(urdf=root / task.station, drawers=DRAWERS, pose=CABINET_POSE) if task.station else None,
     )
     roles = _roles(layout, models)
     return Episode(
@@ -100,7 +101,7 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
 
 
 def robot_body(robot: Robot, urdf: Path, qpos: Sequence[float] | None = None) -> RobotBody:
-    """A robot as physics sees it, with the remedies for PhysX 5 (``scenes.py``).
+    """A robot as physics sees it, with the remedies for PhysX 5 (``physics/spec.py``).
 
     Joints that nothing moves stay frozen where ``qpos`` [N] has them; without it they are left free.
     """
@@ -119,7 +120,7 @@ def robot_body(robot: Robot, urdf: Path, qpos: Sequence[float] | None = None) ->
         ignored=tuple((link, _shared_bits(link, pairs)) for link in touching),
         tcp=robot.tool,
         fingers=tuple(
-            Finger(link=link, side=side, opening=finger.opening)
+            FingerLink(link=link, side=side, opening=finger.opening)
             for side, finger in enumerate(robot.fingers)
             for link in finger.links
         ),
@@ -152,27 +153,27 @@ def _body(placed: Placed, models: dict[str, ModelInfo], root: Path, notes: list[
     )
 
 
-def _stage(task: SimplerTask, root: Path, notes: list[str]) -> Stage | None:
+def _stage(task: SimplerTask, root: Path, notes: list[str]) -> StageBody | None:
     """The surroundings that things can touch."""
     if task.stage.mesh is None or not task.stage.solid:
         return None
     found = assets.resolve(task.stage.mesh, root)
     if found.path is not None:
-        return Stage(mesh=found.path, mesh_pose=task.stage.turn, offset=task.stage.offset)
+        return StageBody(mesh=found.path, mesh_pose=task.stage.turn, offset=task.stage.offset)
     assert found.stand_in is not None  # ``resolve`` gives one or the other
     notes.append(found.note)
     low, high = _TABLETOPS.get(task.suite, _COKE_TABLETOP)
     centre = (*((a + b) / 2 for a, b in zip(low, high, strict=True)), found.stand_in.top - _THICKNESS / 2)
     half = (*((b - a) / 2 for a, b in zip(low, high, strict=True)), _THICKNESS / 2)
-    return Stage(boxes=(Box(centre=_three(centre), half_size=_three(half)),))
+    return StageBody(boxes=(Box(centre=_three(centre), half_size=_three(half)),))
 
 
-def drawn_stage(episode: Episode, root: Path) -> Stage | None:
+def drawn_stage(episode: Episode, root: Path) -> StageBody | None:
     """The surroundings as they are drawn: rooms around cabinets can be seen but not touched."""
     stage = episode.task.stage
     if stage.solid or stage.mesh is None:
         return episode.spec.stage
-    return Stage(mesh=root / stage.mesh, mesh_pose=stage.turn, offset=stage.offset, solid=False)
+    return StageBody(mesh=root / stage.mesh, mesh_pose=stage.turn, offset=stage.offset, solid=False)
 
 
 def _undrawn(task: SimplerTask, root: Path) -> tuple[str, ...]:
@@ -186,10 +187,10 @@ def _undrawn(task: SimplerTask, root: Path) -> tuple[str, ...]:
 
 
 def require_drawable(episode: Episode, root: Path) -> None:
-    """Whether everything is there that pictures of an episode need.
+    """Check that every file is there that rendering an episode needs.
 
     Raises:
-        AssetsMissing: something is not; the message names the file.
+        AssetsMissing: a file is missing; the message names it.
     """
     if episode.undrawn:
         raise AssetsMissing(assets.NAME, f"{root} has no {episode.undrawn[0]}", assets.HOW_TO_GET_VARIANTS)

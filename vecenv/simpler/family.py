@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from vecenv import protocols
 from vecenv.registry import ExtraMissing
-from vecenv.simpler import tasks as simpler_tasks
 from vecenv.simpler.tasks import SUITES, list_tasks
 
 if TYPE_CHECKING:
@@ -49,12 +48,7 @@ def make(suite: str, tasks: object, episodes: object, config: SimplerConfig) -> 
 
 def eval_metadata(suite: str, protocol: str) -> dict[str, object]:
     """What ``vecenv.eval_metadata`` returns of a SIMPLER suite: episodes as the protocol has them of each task."""
-    chosen = protocols.protocol(protocol, protocols.SIMPLER)
-    metadata = {**simpler_tasks.eval_metadata(suite), "protocol": chosen.to_dict()}
-    if chosen.episodes is not None:
-        return metadata
-    from vecenv.simpler.published import lists
+    from vecenv.simpler.published import metadata
 
-    counts = lists.counts(chosen.name, suite)
-    per_task = tuple(counts.get(index, 0) for index in range(len(list_tasks(suite))))
-    return {**metadata, "episodes_per_task": per_task, "num_episodes": sum(per_task)}
+    chosen = protocols.protocol(protocol, protocols.SIMPLER)
+    return {**metadata.eval_metadata(suite, chosen.name), "protocol": chosen.to_dict()}

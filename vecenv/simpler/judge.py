@@ -1,8 +1,8 @@
 """When a SIMPLER task is solved: upstream's success criteria on what was measured after a control tick.
 
-In: a row of ``scenes.facts_dtype`` after the objects settled, then one after every tick. Out: ``Verdict``, success and
-what it is made of. Thresholds are the task's (``tasks.py``); impulses count when they are at least, or above, 1e-6 N s,
-as upstream has it. One ``Judge`` is one episode of one slot.
+In: a row of ``physics.spec.facts_dtype`` after the objects settled, then one after every tick. Out: ``Verdict``,
+success and its parts. Thresholds are the task's (``task_spec.py``); impulses count when they are at least, or above,
+1e-6 N s, as upstream has it. One ``Judge`` is one episode of one slot.
 
 Two oddities are upstream's and kept: an object's bounding box is turned as if its size were a vector, so extents can be
 negative; and what counts as lifted is remembered until the grasp is lost, not until the object is put down.
@@ -16,8 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.simpler.control.kinematics import rotation_from_quat
-from vecenv.simpler.tasks import DrawerSuccess, MoveNearSuccess, PickSuccess, PlaceSuccess, PutOnSuccess, SimplerTask
+from vecenv.simpler.control.rotations import rotation_from_quat
+from vecenv.simpler.task_spec import (
+    DrawerSuccess,
+    MoveNearSuccess,
+    PickSuccess,
+    PlaceSuccess,
+    PutOnSuccess,
+    SimplerTask,
+)
 
 # Steps in a row that make a grasp a firm one.
 _FIRM = 5
@@ -28,7 +35,7 @@ class Verdict:
     """Whether the task is solved after a tick, and upstream's intermediate results by name."""
 
     success: bool
-    parts: dict[str, Any] = field(default_factory=dict)
+    parts: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +54,7 @@ class Judge:
 
     Args:
         task: the task.
-        roles: who is who.
+        roles: of the objects.
         settled: facts before the first tick.
     """
 

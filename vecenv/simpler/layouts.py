@@ -1,30 +1,42 @@
-"""What an episode of SIMPLER consists of: which objects, where they are dropped, where the robot stands, what is said.
+"""What an episode of SIMPLER consists of: objects, where they are dropped, where the robot stands, the instruction.
 
 In: a task and its ``Choices``: the robot's place, the object's, the drawer, the arrangement. They are drawn from a seed
-(``drawn``) or come from a published list (``published.py``). Out: a ``Layout`` (``lay_out``). Draws are made by NumPy's
+(``drawn``) or come from a published list (``published/lists.py``). Out: a ``Layout`` (``lay_out``). Draws use NumPy's
 ``RandomState`` alone, draw for draw as upstream does it (ManiSkill2_real2sim commit ef7a4d4, ``envs/custom_scenes``).
 Each class of upstream's hierarchy starts the episode's stream anew, so draws of different layers are made from equal
 streams: that is why several functions begin with a fresh ``RandomState(seed)``. Objects are given where they are
-dropped, half a metre above the table; where they end is the simulator's business.
+dropped, half a metre above the table; the simulator lets them settle.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
-from types import MappingProxyType
-from typing import Any, TypedDict
+from typing import Required, TypedDict
 
 import numpy as np
 
 from vecenv.errors import InvalidInput
-from vecenv.simpler.tasks import DRAWERS, FIRST_SEED, NUM_EPISODES, ORIENTATIONS, SimplerTask
+from vecenv.simpler.stations import (
+    DRAWER_STATIONS,
+    MOVE_NEAR_STATION,
+    PICK_STATION,
+    Quat,
+    at_sink,
+    first_posture,
+    multiply_quats,
+    put_on_station,
+    roll_quat,
+    stand,
+    yaw_quat,
+)
+from vecenv.simpler.task_spec import DRAWERS, ORIENTATIONS, SimplerTask
+from vecenv.simpler.tasks import FIRST_SEED, NUM_EPISODES
 
 Vector = tuple[float, float, float]
-Quat = tuple[float, float, float, float]
 _UPRIGHT: Quat = (1.0, 0.0, 0.0, 0.0)
 DROP_HEIGHT = 0.5
 """Metres above the table from which objects are dropped."""
@@ -50,7 +62,7 @@ class Choices:
         robot_xy: where the robot's root link stands, metres, world frame.
         robot_quat: of the root link, wxyz.
         urdf_version: which of the robot's versions; "" is the plain one.
-        overlay: picture that replaces the background, in the asset tree; None where the drawn scene is shown.
+        overlay: image that replaces the background, in the asset tree; None where the drawn scene is shown.
         model: of ``pick`` and ``place``, the object.
         object_xy: of ``pick`` and ``place``, above which point the object is dropped, metres, world frame.
         orientation: of ``pick``, how the object lies: one of ``ORIENTATIONS``.
@@ -77,7 +89,7 @@ class Placed:
 
     Attributes:
         model: its name, also of its folder in the asset tree.
-        role: ``source`` (what is to be moved), ``target``, ``other``, ``distractor`` (likewise, but dropped when the
+        role: ``source`` (the object to move), ``target``, ``other``, ``distractor`` (likewise, but dropped when the
             rest has settled), or ``fixture`` (does not move).
         position: metres, world frame; where it is dropped, or stands.
         quat: wxyz, world frame.
@@ -104,11 +116,11 @@ class Layout:
         base_quat: wxyz.
         qpos: the robot's joints, radians and metres, in the order of ``Robot.joints``.
         urdf_version: which of the robot's versions.
-        overlay: picture that replaces the background, in the asset tree; None where the drawn scene is shown.
+        overlay: image that replaces the background, in the asset tree; None where the drawn scene is shown.
         drawer: which drawer the task is about, "" when none.
         drawer_qpos: how far it is open at first, metres.
-        instruction: what a policy is told at first.
-        second_instruction: what it is told in the second half of a ``place`` episode, else "".
+        instruction: the policy's instruction at first.
+        second_instruction: its instruction in the second half of a ``place`` episode, else "".
         orientation: of ``pick``, how the object lies.
         episode_id: upstream's number of the arrangement, None where it has none.
     """
@@ -132,6 +144,18 @@ class Layout:
     def with_role(self, role: str) -> tuple[Placed, ...]:
         """The objects of a role."""
         return tuple(placed for placed in self.objects if placed.role == role)
+
+
+class _FamilyFields(TypedDict, total=False):
+    """Fields of a ``Layout`` that depend on the task's family."""
+
+    objects: Required[tuple[Placed, ...]]
+    instruction: Required[str]
+    second_instruction: str
+    orientation: str
+    episode_id: int
+    drawer: str
+    drawer_qpos: float
 
 
 def episode_seed(episode: int) -> int:
@@ -184,7 +208,7 @@ def lay_out(task: SimplerTask, choices: Choices) -> Layout:
     """
     drawer = {"open": _drawer, "close": _drawer, "place": _place}
     families = {"pick": _pick, "move_near": _move_near, "put_on": _put_on, **drawer}
-    height, qpos = _posture(task)
+    height, qpos = first_posture(task)
     return Layout(
         task=task.name,
         seed=choices.seed,
@@ -202,78 +226,6 @@ def object_words(model: str) -> str:
     """An object's name as instructions say it: upstream's ``_get_instruction_obj_name``."""
     silent = {"opened", "light", "generated", "modified", "objaverse", "bridge", "baked", "v2"}
     return " ".join(word for word in model.split("_") if word not in silent and not word.endswith("cm"))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The robots' first postures.
-
-_GOOGLE_QPOS = (
-    -0.2639457174606611,
-    0.0831913360274175,
-    0.5017611504652179,
-    1.156859026208673,
-    0.028583671314766423,
-    1.592598203487462,
-    -1.080652960128774,
-    0.0,
-    0.0,
-    -0.00285961,
-    0.7851361,
-)
-_WIDOWX_QPOS = (-0.01840777, 0.0398835, 0.22242722, -0.00460194, 1.36524296, 0.00153398, 0.037, 0.037)
-_SINK_QPOS = (-0.2600599, -0.12875618, 0.04461369, -0.00652761, 1.7033415, -0.26983038, 0.037, 0.037)
-# Heights of the base: WidowX at the table, at the sink; the Google Robot's, which is its own and the floor's.
-_WIDOWX_HEIGHT, _SINK_HEIGHT, _GOOGLE_HEIGHT = 0.87, 0.85, 0.06205 + 0.017
-_TURNED: Quat = (0.0, 0.0, 0.0, 1.0)
-Station = tuple[float, float, float]
-WIDOWX_STATION: Station = (0.147, 0.028, 0.0)
-"""Where a robot stands: x, y (metres) and yaw (radians)."""
-SINK_STATION: Station = (0.127, 0.06, 0.0)
-PICK_STATION: Station = (0.35, 0.20, 0.0)
-MOVE_NEAR_STATION: Station = (0.35, 0.21, -0.09)
-DRAWER_STATIONS: Mapping[str, Station] = MappingProxyType(
-    {
-        "a0": (0.644, -0.179, -0.03),
-        "a1": (0.765, -0.182, -0.02),
-        "a2": (0.889, -0.203, -0.06),
-        "b0": (0.652, 0.009, 0.0),
-        "b1": (0.752, 0.009, 0.0),
-        "b2": (0.851, 0.035, 0.0),
-        "c0": (0.665, 0.224, 0.0),
-        "c1": (0.765, 0.222, -0.025),
-        "c2": (0.865, 0.222, -0.025),
-    }
-)
-"""Where the real robot stood when the pictures of the drawers were taken."""
-
-
-class Stand(TypedDict):
-    """The robot's place, as ``Choices`` has it."""
-
-    robot_xy: tuple[float, float]
-    robot_quat: Quat
-
-
-def stand(station: Station) -> Stand:
-    """A robot's place: yaw is added to the half turn by which the robots face their tables."""
-    x, y, yaw = station
-    return {"robot_xy": (x, y), "robot_quat": _multiply(_yaw(yaw), _TURNED)}
-
-
-def put_on_station(task: SimplerTask) -> Station:
-    """Where WidowX stands in a task of ``put_on``."""
-    return SINK_STATION if _at_sink(task) else WIDOWX_STATION
-
-
-def _at_sink(task: SimplerTask) -> bool:
-    return task.name == "widowx_put_eggplant_in_basket"
-
-
-def _posture(task: SimplerTask) -> tuple[float, tuple[float, ...]]:
-    """Height of the base, metres, and the joints at the beginning."""
-    if task.family != "put_on":
-        return _GOOGLE_HEIGHT, _GOOGLE_QPOS
-    return (_SINK_HEIGHT, _SINK_QPOS) if _at_sink(task) else (_WIDOWX_HEIGHT, _WIDOWX_QPOS)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -297,8 +249,12 @@ def _draw_pick(task: SimplerTask, seed: int) -> Choices:
     )
 
 
-def _pick(task: SimplerTask, choices: Choices) -> dict[str, Any]:
-    turns = {"upright": _roll(math.pi / 2), "laid_vertically": _yaw(math.pi / 2), "lr_switch": _yaw(math.pi)}
+def _pick(task: SimplerTask, choices: Choices) -> _FamilyFields:
+    turns = {
+        "upright": roll_quat(math.pi / 2),
+        "laid_vertically": yaw_quat(math.pi / 2),
+        "lr_switch": yaw_quat(math.pi),
+    }
     quat = turns[_known("orientation", choices.orientation, turns)]
     return {
         "objects": (_source(task, choices, quat),),
@@ -343,7 +299,7 @@ def _arrangement(task: SimplerTask, choices: Choices) -> int:
     return number
 
 
-def _move_near(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _move_near(task: SimplerTask, choices: Choices) -> _FamilyFields:
     episode = _arrangement(task, choices)
     triplet, corners = task.triplets[episode // _PER_TRIPLET], _TRIANGLES[episode % _PER_TRIPLET // len(_PAIRS)]
     source, target = _PAIRS[episode % len(_PAIRS)]
@@ -369,12 +325,12 @@ def _standing(model: str) -> Quat:
     if "apple" in model:
         return _UPRIGHT
     if "can" in model.split("_"):
-        return _roll(math.pi / 2)
-    return _multiply(_yaw(math.pi / 2), _roll(math.pi / 2)) if "bottle" in model else _yaw(math.pi / 2)
+        return roll_quat(math.pi / 2)
+    return multiply_quats(yaw_quat(math.pi / 2), roll_quat(math.pi / 2)) if "bottle" in model else yaw_quat(math.pi / 2)
 
 
 def _draw_station(task: SimplerTask, seed: int) -> Choices:
-    """Drawer, picture and URDF version, drawn from one stream."""
+    """Drawer, image and URDF version, drawn from one stream."""
     rng = _stream(seed)
     drawer = str(rng.choice(list(task.drawers)))
     overlay = task.overlays[int(rng.choice(len(task.overlays)))]
@@ -383,7 +339,7 @@ def _draw_station(task: SimplerTask, seed: int) -> Choices:
     return Choices(seed=seed, **stand(station), urdf_version=version, overlay=overlay, drawer=drawer)
 
 
-def _drawer(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _drawer(task: SimplerTask, choices: Choices) -> _FamilyFields:
     drawer = _known("drawer", choices.drawer, DRAWERS)
     return {
         "objects": (),
@@ -399,7 +355,7 @@ def _draw_place(task: SimplerTask, seed: int) -> Choices:
     return replace(_draw_station(task, seed), model=model, object_xy=(float(x), float(y)))
 
 
-def _place(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _place(task: SimplerTask, choices: Choices) -> _FamilyFields:
     drawer = _known("drawer", choices.drawer, DRAWERS)
     return {
         "objects": (_source(task, choices, _UPRIGHT),),
@@ -420,7 +376,7 @@ def _draw_put_on(task: SimplerTask, seed: int) -> Choices:
     return Choices(seed=seed, **stand(put_on_station(task)), overlay=task.overlays[0], episode_id=episode)
 
 
-def _put_on(task: SimplerTask, choices: Choices) -> dict[str, Any]:
+def _put_on(task: SimplerTask, choices: Choices) -> _FamilyFields:
     corners, turns = _put_on_choices(task.name)
     episode = _arrangement(task, choices)
     places, turn = corners[episode // len(turns)], turns[episode % len(turns)]
@@ -428,7 +384,7 @@ def _put_on(task: SimplerTask, choices: Choices) -> dict[str, Any]:
         Placed(model=model, role=role, position=_drop(task, *xy), quat=quat)
         for model, role, xy, quat in zip(task.models, ("source", "target"), places, (turn, _UPRIGHT), strict=True)
     ]
-    if _at_sink(task):
+    if at_sink(task):
         objects.append(Placed(model=SINK, role="fixture", position=_SINK_POSITION, quat=_UPRIGHT))
     return {"objects": tuple(objects), "instruction": task.instruction, "episode_id": episode}
 
@@ -441,11 +397,11 @@ def _put_on_choices(name: str) -> tuple[list[tuple[_XY, _XY]], list[Quat]]:
     if name == "widowx_put_eggplant_in_basket":
         grid = itertools.product(np.linspace(-0.01, 0.01, 2), np.linspace(-0.015, 0.015, 4))
         places = [((float(x) - 0.105, float(y) + 0.206), (-0.125, 0.025)) for x, y in grid]
-        return places, [_yaw(0.0), _yaw(math.pi / 4), _yaw(-math.pi / 4)]
+        return places, [yaw_quat(0.0), yaw_quat(math.pi / 4), yaw_quat(-math.pi / 4)]
     if name == "widowx_stack_cube":
         return _corner_pairs(0.05) + _corner_pairs(0.1), [_UPRIGHT]
-    second = _yaw(math.pi / 2) if name == "widowx_spoon_on_towel" else _yaw(-math.pi / 2)
-    first = _UPRIGHT if name == "widowx_spoon_on_towel" else _yaw(math.pi)
+    second = yaw_quat(math.pi / 2) if name == "widowx_spoon_on_towel" else yaw_quat(-math.pi / 2)
+    first = _UPRIGHT if name == "widowx_spoon_on_towel" else yaw_quat(math.pi)
     return _corner_pairs(0.075), [first, second]
 
 
@@ -456,7 +412,7 @@ def _corner_pairs(half: float) -> list[tuple[_XY, _XY]]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Draws and rotations.
+# Draws.
 
 
 def _stream(seed: int) -> np.random.RandomState:
@@ -470,21 +426,3 @@ def _choice(models: Sequence[str], rng: np.random.RandomState) -> str:
 
 def _drop(task: SimplerTask, x: float, y: float) -> Vector:
     return float(x), float(y), task.stage.table_height + DROP_HEIGHT
-
-
-def _yaw(angle: float) -> Quat:
-    return math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)
-
-
-def _roll(angle: float) -> Quat:
-    return math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0
-
-
-def _multiply(a: Quat, b: Quat) -> Quat:
-    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )

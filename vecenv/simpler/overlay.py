@@ -1,10 +1,9 @@
-"""SIMPLER's pictures: the scene drawn by SAPIEN, and the real photograph that replaces its background.
+"""SIMPLER's images: the scene rendered by SAPIEN, and the photograph that replaces its background.
 
-In: what there is to see of an episode, and a row of facts. Out, in arrays of the caller: colours as policies see them,
-depth, and what each pixel shows.
-A ``Painter`` keeps *twins*: scenes with everything that is drawn, which are never stepped but posed like the slot they
-are to show. So physics itself needs no renderer, and slots that look alike share one twin. Drawing needs a Vulkan
-driver: a GPU's, or Mesa's lavapipe on a CPU (Mesa 24.3 or later).
+In: what to render of an episode, and a row of facts. Out, in arrays of the caller: colours as policies see them, depth,
+and a segmentation. A ``Renderer`` keeps scenes with visual shapes that are never stepped; they take the poses of the
+slot to render. So physics needs no renderer, and slots that look alike share one of these scenes. Rendering needs a
+Vulkan driver: a GPU's, or Mesa's lavapipe on a CPU (Mesa 24.3 or later).
 
 "Visual matching" is upstream's: robot, objects and cabinet are kept where the segmentation shows them, every other
 pixel comes from a photograph of the real place taken by the same camera.
@@ -13,6 +12,7 @@ pixel comes from a photograph of the real place taken by the same camera.
 from __future__ import annotations
 
 import functools
+import mmap
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -26,46 +26,47 @@ from PIL import Image
 
 from vecenv.errors import SimulationError
 from vecenv.simpler.episodes import Episode, drawn_stage, require_drawable
-from vecenv.simpler.physics.scenes import CABINET, ROBOT, Scene, SceneSpec, instances
-from vecenv.simpler.tasks import Camera, Lighting
+from vecenv.simpler.physics.scenes import Scene
+from vecenv.simpler.physics.spec import CABINET, ROBOT, SceneSpec, instances
+from vecenv.simpler.task_spec import Camera, Lighting
 
-# What upstream gives robots and, in one task, objects.
+# Materials that upstream gives to robots and, in one task, to objects.
 _SHINY = {"specular": 0.9, "roughness": 0.3}
 _MATTE = {"specular": 0.0, "roughness": 1.0, "metallic": 0.0}
 _SHADOW_EXTENT, _SHADOW_PIXELS = 5.0, 2048
 _FLOOR_HALF = [10.0, 10.0, 0.017]
-# Twins kept; each holds a scene's meshes and textures.
-_TWINS = 12
+# Scenes kept; each holds its meshes and textures.
+_MAX_SCENES = 12
 
 
 class RendererMissing(SimulationError):
     """There is no usable Vulkan driver; the message says what to install."""
 
 
-class Pictures(NamedTuple):
-    """What cameras see; arrays to be filled or that were.
+class Images(NamedTuple):
+    """Images of one camera or of one camera a slot.
 
     Attributes:
         rgb: colours, uint8 [..., H, W, 3].
-        segmentation: index into ``scenes.instances`` of the episode's scene, int16 [..., H, W]; 0 is everything that
-            the photograph replaces.
+        segmentation: index into ``physics.spec.instances`` of the episode's scene, int16 [..., H, W]; 0 is
+            everything that the photograph replaces.
         depth: distance from the camera's plane, metres, float32 [..., H, W]; of the drawn scene, the photograph has
-            none. None where it was not asked for.
+            none. None where depth was not requested.
     """
 
     rgb: np.ndarray
     segmentation: np.ndarray
     depth: np.ndarray | None
 
-    def of(self, slot: int) -> Pictures:
-        """Those of one slot, views."""
+    def of(self, slot: int) -> Images:
+        """The images of one slot, as views."""
         depth = None if self.depth is None else self.depth[slot]
-        return Pictures(self.rgb[slot], self.segmentation[slot], depth)
+        return Images(self.rgb[slot], self.segmentation[slot], depth)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Canvas:
-    """Room for pictures of B slots, with depth if ``deep``."""
+class ImageBuffer:
+    """Layout of the memory for images of B slots, with depth if ``deep``."""
 
     slots: int
     height: int
@@ -74,14 +75,14 @@ class Canvas:
 
     @property
     def bytes(self) -> int:
-        """That it takes."""
+        """Size of the memory, bytes."""
         return self.slots * self.height * self.width * (9 if self.deep else 5)
 
-    def pictures(self, memory: Any) -> Pictures:
+    def images(self, memory: mmap.mmap | bytearray) -> Images:
         """Arrays with B rows over a buffer."""
         shape, count = (self.slots, self.height, self.width), self.slots * self.height * self.width
         begin = 4 * count if self.deep else 0
-        return Pictures(
+        return Images(
             depth=np.frombuffer(memory, np.float32, count).reshape(shape) if self.deep else None,
             segmentation=np.frombuffer(memory, np.int16, count, begin).reshape(shape),
             rgb=np.frombuffer(memory, np.uint8, 3 * count, begin + 2 * count).reshape(*shape, 3),
@@ -89,7 +90,7 @@ class Canvas:
 
 
 class _Minimal:
-    """SAPIEN's shader without shadows: 0.4 of the other's time on a CPU, and as near to SAPIEN 2's pictures."""
+    """SAPIEN's shader without shadows: 0.4 of the other's time on a CPU, and as close to SAPIEN 2's images."""
 
     # Textures' formats; positions are whole millimetres.
     _FORMATS = MappingProxyType(
@@ -101,12 +102,14 @@ class _Minimal:
     )
 
     def choose(self) -> None:
-        """Make it the shader of cameras made from now on."""
+        """Use it for cameras that are created from now on."""
         sapien.render.set_camera_shader_dir("minimal")
         for name, kind in self._FORMATS.items():
             sapien.render.set_picture_format(name, kind)
 
-    def read(self, camera: Any, depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def read(
+        self, camera: sapien.render.RenderCameraComponent, depth: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Colours uint8 [H, W, 4] and entities int16 [H, W]; fills ``depth`` [H, W] with metres."""
         both = camera.get_picture("PositionSegmentation")
         if depth is not None:
@@ -118,11 +121,13 @@ class _Default:
     """SAPIEN's standard shader, which can draw shadows."""
 
     def choose(self) -> None:
-        """Make it the shader of cameras made from now on."""
+        """Use it for cameras that are created from now on."""
         sapien.render.set_camera_shader_dir("default")
         sapien.render.set_picture_format("Color", "r32g32b32a32sfloat")
 
-    def read(self, camera: Any, depth: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def read(
+        self, camera: sapien.render.RenderCameraComponent, depth: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Colours uint8 [H, W, 3] and entities [H, W]; fills ``depth`` [H, W] with metres."""
         if depth is not None:
             np.negative(camera.get_picture("Position")[..., 2], out=depth)
@@ -134,8 +139,8 @@ MINIMAL, DEFAULT = _Minimal(), _Default()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Style:
-    """How episodes are drawn.
+class RenderStyle:
+    """How episodes are rendered.
 
     Attributes:
         overlay: ``"background"``, upstream's visual matching; ``"none"``, the drawn scene; or ``"blend"``, both at one
@@ -149,8 +154,8 @@ class Style:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
-    """What is to be seen of an episode.
+class RenderSubject:
+    """What to render of an episode.
 
     Attributes:
         spec: its scene, with the robot's own colours.
@@ -169,11 +174,11 @@ class Subject:
     photo: Path | None
 
     @classmethod
-    def of(cls, episode: Episode, root: Path) -> Subject:
-        """Of an episode; ``root`` is that of the asset tree.
+    def of(cls, episode: Episode, root: Path) -> RenderSubject:
+        """What to render of an episode; ``root``: of the asset tree.
 
         Raises:
-            AssetsMissing: a file that only pictures need is not there; the message names it.
+            AssetsMissing: a file that only rendering needs is missing; the message names it.
         """
         task, layout = episode.task, episode.layout
         require_drawable(episode, root)
@@ -189,25 +194,25 @@ class Subject:
         )
 
 
-class Painter:
-    """Draws episodes in a style."""
+class Renderer:
+    """Renders episodes in one style."""
 
-    def __init__(self, style: Style) -> None:
+    def __init__(self, style: RenderStyle) -> None:
         self.style = style
-        self._twins: OrderedDict[Any, _Twin] = OrderedDict()
+        self._scenes: OrderedDict[Any, _RenderScene] = OrderedDict()
 
-    def paint(self, subject: Subject, facts: np.void, out: Pictures) -> None:
-        """The third-person camera's picture of a subject in the state that the facts describe.
+    def render(self, subject: RenderSubject, facts: np.void, out: Images) -> None:
+        """Render the third-person camera's image of a subject.
 
         Args:
-            subject: what is to be seen.
-            facts: how it stands.
-            out: where the picture goes.
+            subject: what to render.
+            facts: its state.
+            out: arrays to fill.
 
         Raises:
             RendererMissing: no Vulkan driver.
         """
-        colours = self._twin(subject).draw(facts, subject.hidden, out)
+        colours = self._scene_of(subject).draw(facts, subject.hidden, out)
         if self.style.overlay == "none" or subject.photo is None:
             out.rgb[:] = colours[..., :3]
             return
@@ -220,24 +225,24 @@ class Painter:
         shown = np.flatnonzero(out.segmentation)
         out.rgb.reshape(-1, 3)[shown] = colours.reshape(-1, colours.shape[-1])[shown, :3]
 
-    def _twin(self, subject: Subject) -> _Twin:
+    def _scene_of(self, subject: RenderSubject) -> _RenderScene:
         key = (subject.spec, subject.camera, subject.lighting, subject.shiny, subject.matte)
-        if key not in self._twins:
-            self._twins[key] = _Twin(subject, self.style.shadows)
-            while len(self._twins) > _TWINS:
-                self._twins.popitem(last=False)
-        self._twins.move_to_end(key)
-        return self._twins[key]
+        if key not in self._scenes:
+            self._scenes[key] = _RenderScene(subject, self.style.shadows)
+            while len(self._scenes) > _MAX_SCENES:
+                self._scenes.popitem(last=False)
+        self._scenes.move_to_end(key)
+        return self._scenes[key]
 
     def close(self) -> None:
-        """Forget all twins."""
-        self._twins.clear()
+        """Release all scenes."""
+        self._scenes.clear()
 
 
-class _Twin:
-    """A scene to be drawn."""
+class _RenderScene:
+    """A scene with visual shapes, never stepped."""
 
-    def __init__(self, subject: Subject, shadows: bool) -> None:
+    def __init__(self, subject: RenderSubject, shadows: bool) -> None:
         check_renderer()
         shadows = shadows or subject.lighting.casts
         self._scene = Scene(subject.spec, visuals=True)
@@ -247,14 +252,14 @@ class _Twin:
             self._draw_floor()
         self._shader = DEFAULT if shadows else MINIMAL
         self._camera = self._mount(subject.camera)
-        self._paint_surfaces(subject)
+        self._set_materials(subject)
 
     def _draw_floor(self) -> None:
         builder = self._scene.sapien.create_actor_builder()
         builder.add_box_visual(half_size=_FLOOR_HALF, material=[1.0, 1.0, 1.0])  # type: ignore
         builder.build_static(name="floor")
 
-    def _mount(self, camera: Camera) -> Any:
+    def _mount(self, camera: Camera) -> sapien.render.RenderCameraComponent:
         self._shader.choose()
         made = sapien.render.RenderCameraComponent(camera.width, camera.height)
         made.set_perspective_parameters(camera.near, camera.far, *camera.focal, *camera.centre, 0.0)
@@ -263,16 +268,16 @@ class _Twin:
         made.set_local_pose(frame.local * sapien.Pose(list(camera.position), list(camera.quat)))
         return made
 
-    def _paint_surfaces(self, subject: Subject) -> None:
+    def _set_materials(self, subject: RenderSubject) -> None:
         if subject.shiny:
             for link in self._scene.robot.physx.links:
-                _give(link.entity, _SHINY)
+                _set_properties(link.entity, _SHINY)
         for thing in self._scene.objects:
             if subject.matte:
-                _give(thing, _MATTE)
-            _let_shine(thing)
+                _set_properties(thing, _MATTE)
+            _enable_emission(thing)
 
-    def draw(self, facts: np.void, hidden: frozenset[str], out: Pictures) -> np.ndarray:
+    def draw(self, facts: np.void, hidden: frozenset[str], out: Images) -> np.ndarray:
         """Fill segmentation and depth; returns the colours, uint8 [H, W, 3 or 4]."""
         scene = self._scene
         scene.show(facts)
@@ -307,22 +312,22 @@ def _light(scene: sapien.Scene, lighting: Lighting, shadows: bool) -> None:
         )
 
 
-def _materials(entity: sapien.Entity) -> Iterator[Any]:
+def _materials(entity: sapien.Entity) -> Iterator[sapien.render.RenderMaterial]:
     body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
     for shape in body.render_shapes if body is not None else ():  # type: ignore
         for part in shape.parts if hasattr(shape, "parts") else (shape,):
             yield part.material
 
 
-def _give(entity: sapien.Entity, values: dict[str, float]) -> None:
+def _set_properties(entity: sapien.Entity, values: dict[str, float]) -> None:
     """Set properties of all materials of an entity."""
     for material in _materials(entity):
         for name, value in values.items():
             setattr(material, name, value)
 
 
-def _let_shine(entity: sapien.Entity) -> None:
-    """Baked textures are emissive ones without a factor, which SAPIEN 3 takes for 0 and SAPIEN 2 took for 1."""
+def _enable_emission(entity: sapien.Entity) -> None:
+    """Set the emission factor of baked textures to 1: SAPIEN 3 reads a missing factor as 0, SAPIEN 2 as 1."""
     for material in _materials(entity):
         if material.emission_texture is not None and not any(material.emission[:3]):
             material.emission = [1.0, 1.0, 1.0, 1.0]
@@ -340,10 +345,10 @@ def _photo(path: Path, width: int, height: int) -> np.ndarray:
 
 @functools.cache
 def check_renderer() -> None:
-    """Whether SAPIEN finds something to draw with.
+    """Check that SAPIEN can render.
 
     Raises:
-        RendererMissing: it does not.
+        RendererMissing: it cannot.
     """
     try:
         sapien.render.RenderMaterial()

@@ -1,8 +1,8 @@
 """Ground truth of a SIMPLER slot, as planners read it: ``ObjectsSnapshot`` from an episode and its facts.
 
-In: an ``Episode`` and a row of ``scenes.facts_dtype``. Out: surface samples of every object's collision mesh and of the
-cabinet's boxes, poses, the drawers as parts with their joints, and the task's goal as a predicate. Samples are drawn
-once a mesh, always the same ones.
+In: an ``Episode`` and a row of ``physics.spec.facts_dtype``. Out: surface samples of every object's collision mesh and
+of the cabinet's boxes, poses, the drawers as parts with their joints, and the task's goal as a predicate. Samples of a
+mesh are drawn once and are always the same.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
-from vecenv.simpler.control.kinematics import rotation_from_quat
+from vecenv.simpler.control.rotations import rotation_from_quat
 from vecenv.simpler.episodes import Episode
-from vecenv.simpler.tasks import BRIDGE, SimplerTask
+from vecenv.simpler.task_spec import BRIDGE, SimplerTask
 
 _SAMPLES = 300
 _FACE_STEPS = 6

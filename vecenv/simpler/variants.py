@@ -4,7 +4,7 @@ In: a ``Variant`` and an episode's task and layout. Out: both, changed (``varied
 variant aggregation (SimplerEnv commit 4ab7178, ``scripts/*_variant_agg.sh``; ManiSkill2_real2sim commit ef7a4d4). With
 ``make(variant=...)`` they are put on episodes that seeds decide, where ``overlay="none"`` belongs to most of them;
 upstream's own episodes, on grids of robot and object positions, are ``make(protocol="variant-aggregation")``
-(``published.py``).
+(``published/lists.py``).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,12 +22,15 @@ from vecenv.assets import AssetsMissing
 from vecenv.errors import InvalidInput
 from vecenv.simpler.assets.files import NAME, how_to_get
 from vecenv.simpler.layouts import Layout, Placed
-from vecenv.simpler.tasks import DATA, DirectionalLight, Lighting, SimplerTask, Stage
+from vecenv.simpler.task_spec import DATA, DirectionalLight, Lighting, SimplerTask, StageSpec
 
 _ON_TABLE, _AT_CABINET = ("pick", "move_near"), ("open", "close", "place")
 _GOOGLE_FAMILIES = (*_ON_TABLE, *_AT_CABINET)
 _COKE = "opened_coke_can"
 _AMBIENT = (0.3, 0.3, 0.3)
+
+
+_T = TypeVar("_T")
 
 
 class VariantError(InvalidInput):
@@ -106,7 +109,7 @@ class Variant:
     distractors: str | None = None
 
 
-def make_variant(given: Variant | Mapping[str, Any] | None) -> Variant | None:
+def make_variant(given: Variant | Mapping[str, str | None] | None) -> Variant | None:
     """A variant as it is, or of a mapping of its fields.
 
     Raises:
@@ -125,7 +128,7 @@ def varied(task: SimplerTask, layout: Layout, variant: Variant | None) -> tuple[
     """An episode's task and layout under a variant.
 
     Raises:
-        VariantError: the variant has nothing to say about this task; the message says what it may be.
+        VariantError: the variant does not apply to this task; the message lists those that do.
     """
     if variant is None or variant == Variant():
         return task, layout
@@ -157,14 +160,14 @@ def _task_changes(task: SimplerTask, variant: Variant) -> dict[str, Any]:
         changes["station"] = DATA / f"custom/{name}.urdf"
     if variant.stage is not None:
         name = _chosen(task, "stage", variant.stage, {} if cabinet else {each: each for each in STAGES})
-        changes["stage"] = Stage(name=name, offset=task.stage.offset, table_height=task.stage.table_height)
+        changes["stage"] = StageSpec(name=name, offset=task.stage.offset, table_height=task.stage.table_height)
     return changes
 
 
-def _chosen(task: SimplerTask, what: str, value: str, known: Mapping[str, Any]) -> Any:
+def _chosen(task: SimplerTask, what: str, value: str, known: Mapping[str, _T]) -> _T:
     if value not in known:
         there = f"one of {', '.join(known)}" if known else "none at all"
-        raise VariantError(f"variant: {what}={value!r} is not there for {task.name}; expected {there}")
+        raise VariantError(f"variant: {what}={value!r} is not available for {task.name}; expected {there}")
     return known[value]
 
 

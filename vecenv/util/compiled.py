@@ -26,6 +26,14 @@ def builtin(function: Callable[..., Any]) -> Any:
     return intrinsic(prefer_literal=True)(function)
 
 
+def compile_function(signature: Any, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile for calls from Python, or read from numba's cache: beside the file, else the user's, else none."""
+    try:
+        return numba.njit([signature], cache=True, **OPTIONS)(function)
+    except RuntimeError:  # numba finds no folder that it may write
+        return numba.njit([signature], **OPTIONS)(function)
+
+
 def compile_for_c(signature: Any, function: Callable[..., Any]) -> Any:
     """Compile to a C function, or read it from numba's cache: beside the file, else the user's, else none."""
     try:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vecenv.contract import Part, PartJoint
-from vecenv.simpler.control.kinematics import rotvec_from_rotation
+from vecenv.simpler.control.rotations import rotvec_from_rotation
 from vecenv_eval.policies.simpler_reach import Arm, Waypoint, pose, through
 
 # Angles of the closed fingers, radians: below the horizontal, and sideways.

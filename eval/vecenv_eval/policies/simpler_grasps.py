@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vecenv.contract import PointCloud
-from vecenv.simpler.control.kinematics import rotvec_from_rotation
+from vecenv.simpler.control.rotations import rotvec_from_rotation
 from vecenv_eval.policies.simpler_reach import Arm, Hand
 
 _TILTS = np.deg2rad([0.0, 10.0, 20.0, 30.0, 45.0])

@@ -14,17 +14,17 @@ from types import MappingProxyType
 
 import numpy as np
 
-from vecenv.simpler.control.kinematics import (
-    Chain,
-    Clik,
+from vecenv.simpler.control.chain import Chain, Clik
+from vecenv.simpler.control.controllers import controller
+from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX, Robot
+from vecenv.simpler.control.rotations import (
     quat_from_rotation,
-    read_urdf,
     rotation_from_quat,
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
-from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX, Robot, controller
 from vecenv.simpler.control.servo import Servo, ServoConfig
+from vecenv.simpler.control.urdf import read_urdf
 
 # Steps of the way at which the inverse kinematics is solved anew, metres and radians: what a control tick covers.
 _STRIDE, _TURN = 0.05, 0.3

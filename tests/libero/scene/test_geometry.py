@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support import upstream
 
-from vecenv.libero.env import make
+from vecenv import make
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.lean import boxes, capsules, detail, fits, geometry, recipes, vessels
 from vecenv.libero.scene.lean import solids as shapes

@@ -1,9 +1,9 @@
-"""Where SIMPLER's meshes, pictures and robot descriptions lie, which of them are missing, and what stands in for those.
+"""Where SIMPLER's meshes, images and robot descriptions are, which are missing, and what stands in for missing ones.
 
 In: the asset tree, in upstream's own layout (``data/...`` and ``mani_skill2_real2sim/...`` of ManiSkill2_real2sim):
 the folder that ``VECENV_SIMPLER_ASSETS`` names, else the user's data folder, which ``vecenv assets pull simpler``
 fills. Out: ``resolve`` and ``visual_mesh``, paths of files, or a ``StandIn`` where a file is missing that a plain shape
-can replace; whoever uses one has its ``note`` to pass on. ``manifest.json`` lists the files with their hashes,
+can replace; its ``note`` tells the user. ``manifest.json`` lists the files with their hashes,
 ``manifest_variants.json`` those that only variant aggregation needs; both are written by
 ``scripts/simpler_manifest.py``. Downloading is in ``pull.py``.
 """
@@ -14,18 +14,16 @@ import functools
 import hashlib
 import json
 import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import platformdirs
-import typer
 
 from vecenv.assets import AssetRow, AssetsMissing
 from vecenv.errors import InvalidFile
 
 VARIABLE = "VECENV_SIMPLER_ASSETS"
-NAME = "SIMPLER meshes, pictures and robots"
+NAME = "SIMPLER meshes, images and robots"
 HOW_TO_GET = "vecenv assets pull simpler"
 HOW_TO_GET_VARIANTS = "vecenv assets pull simpler-variants"
 MANIFEST = Path(__file__).with_name("manifest.json")
@@ -152,7 +150,7 @@ def _git_blob(file: Path, size: int) -> str:
 
 
 def default_root() -> Path:
-    """Folder that ``vecenv assets pull simpler`` fills unless told otherwise."""
+    """Folder that ``vecenv assets pull simpler`` fills by default."""
     named = os.environ.get(VARIABLE)
     return Path(named).expanduser() if named else platformdirs.user_data_path("vecenv") / "simpler"
 
@@ -218,7 +216,7 @@ class Resolved:
 
 @dataclass(frozen=True, kw_only=True)
 class _Table:
-    """Height of a stage's table, metres; ``proof``: how that is known."""
+    """Height of a stage's table, metres; ``proof``: how it is known."""
 
     top: float
     proof: str
@@ -311,52 +309,3 @@ def _bare_mesh(path: PurePosixPath, tree: Path) -> StandIn:
 def _listed_visual(model: str) -> str:
     names = [path.name for path in read_manifest().by_path if path.parent == _MODELS / model]
     return next((name for name in _VISUALS if name in names), _VISUALS[1])
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Command line.
-
-assets_app = typer.Typer(no_args_is_help=True)
-# What can be pulled -> its manifest; None for the one that ``pull`` takes by itself.
-_SETS = {"simpler": None, "simpler-variants": VARIANTS_MANIFEST}
-
-
-@assets_app.callback()
-def _assets() -> None:
-    """Meshes, pictures and robot descriptions."""
-
-
-@assets_app.command("pull")
-def pull_command(
-    what: str = typer.Argument(..., help=f"Which assets: {', '.join(_SETS)}."),
-    source: str | None = typer.Option(
-        None, "--from", metavar="DIR|URL", help="A folder, archive or web address to take them from, and nothing else."
-    ),
-    to: Path | None = typer.Option(None, "--to", metavar="DIR", help=f"Folder to fill; {VARIABLE} or a default else."),
-) -> None:
-    """Fetch assets: what is there and intact is kept, what was begun is continued, everything is verified."""
-    from rich.progress import Progress
-
-    try:
-        from vecenv.simpler.assets import pull
-    except ImportError as error:
-        typer.echo(f"error: downloading needs {error.name!r}: pip install 'vecenv[simpler]'", err=True)
-        raise typer.Exit(1) from None
-    if what not in _SETS:
-        raise typer.BadParameter(f"{what!r}; known: {', '.join(_SETS)}", param_hint="WHAT")
-    listed = _SETS[what]
-    try:
-        with Progress(transient=True, disable=not sys.stderr.isatty()) as progress:
-            bar = progress.add_task(what)
-            report = pull.pull(
-                to or default_root(),
-                source,
-                manifest=read_manifest(listed) if listed else None,
-                notice=lambda done, total: progress.update(bar, completed=done, total=total),
-            )
-    except (pull.PullError, ManifestError) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(1) from None
-    for line in report.lines():
-        typer.echo(line)
-    raise typer.Exit(0 if report.complete else 1)

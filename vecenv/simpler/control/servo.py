@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.simpler.control.kinematics import (
+from vecenv.simpler.control.controllers import Controller
+from vecenv.simpler.control.robots import WIDOWX, Robot
+from vecenv.simpler.control.rotations import (
     quat_from_rotation,
     rotation_from_quat,
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
-from vecenv.simpler.control.robots import WIDOWX, Controller, Robot
 
 
 @dataclass(frozen=True, kw_only=True)

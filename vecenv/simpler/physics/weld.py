@@ -3,7 +3,7 @@
 In: a SAPIEN scene, a URDF file, what its links are made of. Out: an ``Articulation`` whose joints and frames are
 addressed by the URDF's names. Welding changes nothing that can move: masses, centres and inertias are combined exactly.
 It makes a physics step cheaper, because the solver passes over every link and because shapes of one body are never
-tested against each other (the Google Robot has 37 links for 11 joints). Visual shapes are left out unless asked for, so
+tested against each other (the Google Robot has 37 links for 11 joints). Visual shapes are left out by default, so
 that physics needs no Vulkan.
 """
 
@@ -21,23 +21,12 @@ import sapien
 from sapien import physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
 
+from vecenv.simpler.physics.spec import LinkSurface
+
 # Shapes with the same id (word 3 of a collision group) that share an "ignore" bit (word 2) never collide.
 IGNORE_ID = 1
 # The bit for a robot's root and what it stands on; others are free.
 ROOT_BIT = 1 << 15
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinkSurface:
-    """What the collision shapes of a link are made of.
-
-    Attributes:
-        friction: static and dynamic friction.
-        patch_radius: metres; what torsional friction is computed from.
-    """
-
-    friction: tuple[float, float] = (1.0, 1.0)
-    patch_radius: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +49,7 @@ class Articulation:
 
     Attributes:
         physx: SAPIEN's articulation.
-        joints: column of a named joint -> the joint, without those that are frozen, in the order asked for.
+        joints: column of a named joint -> the joint, without those that are frozen, in the requested order.
         order: index of each of ``joints`` in SAPIEN's qpos.
         frames: every link of the URDF by name.
         frozen: angles of the frozen joints, 0 for the others, float32 [dof].
@@ -123,7 +112,7 @@ def load(
     Args:
         scene: where it goes.
         urdf: the file.
-        joints: names of the active joints, in the order that ``Articulation`` shall use.
+        joints: names of the active joints, in the order that ``Articulation`` uses.
         surfaces: link name -> surface; others have friction 1.
         ignored: link name -> bit set; links that share a bit never collide.
         many_hulls: whether a collision mesh file holds several convex hulls.

@@ -26,7 +26,7 @@ Visual matching's 4 are the robot's colours; variant aggregation's 11, 10 and 7 
 for Octo run the same episodes (visual matching's cans at 501 physics steps a second instead of 513).
 ``move_near_v0`` is what the script runs, ``move_near_v1`` the alternative that it names in a comment, and ``move_near``
 is that too; in variant aggregation all three are the one environment that the script runs. Tasks without a sweep of
-their own have what the script for prepackaged environments runs unless told otherwise: ten resets in a row.
+their own have what the script for prepackaged environments runs by default: ten resets in a row.
 """
 
 from __future__ import annotations
@@ -53,17 +53,9 @@ from vecenv.simpler.published.specs import (
     common_fields,
 )
 from vecenv.simpler.published.sweeps import AGGREGATION, MATCHING
-from vecenv.simpler.tasks import (
-    COKE_TABLE,
-    NUM_EPISODES,
-    PLAIN_MODELS_FILE,
-    PLAIN_TRIPLETS,
-    TASKS,
-    SimplerTask,
-    Stage,
-    UnknownTask,
-    list_tasks,
-)
+from vecenv.simpler.task_spec import SimplerTask, StageSpec
+from vecenv.simpler.task_table import COKE_TABLE, PLAIN_MODELS_FILE, PLAIN_TRIPLETS
+from vecenv.simpler.tasks import NUM_EPISODES, TASKS, UnknownTask, list_tasks
 from vecenv.simpler.variants import varied
 
 __all__ = [
@@ -111,10 +103,10 @@ def _checked(protocol: str, task: str) -> tuple[EpisodeSpec, ...]:
 
 
 def check_protocol(protocol: str) -> str:
-    """The protocol, if there is such a one.
+    """The protocol, if it exists.
 
     Raises:
-        PublishedError: there is not.
+        PublishedError: it does not.
     """
     if protocol not in PROTOCOLS:
         raise PublishedError(f"protocol={protocol!r} is not available; available: {', '.join(PROTOCOLS)}")
@@ -122,7 +114,7 @@ def check_protocol(protocol: str) -> str:
 
 
 def counts(protocol: str, suite: str) -> dict[int, int]:
-    """Index of a task -> how many episodes a protocol has of it, for those tasks of a suite that it has any of.
+    """Index of a task -> how many episodes a protocol has of it, for the tasks of a suite that it has episodes of.
 
     Raises:
         PublishedError: no such protocol, or it has none of this suite.
@@ -235,12 +227,12 @@ def _of_choices(task: SimplerTask, protocol: str, source: str, choices: Choices)
 _GOOGLE_OFFSET = COKE_TABLE.offset
 
 
-def _room(name: str, turn: tuple[float, ...] = COKE_TABLE.turn) -> Stage:
-    return Stage(name=name, offset=_GOOGLE_OFFSET, turn=turn, solid=False)
+def _room(name: str, turn: tuple[float, ...] = COKE_TABLE.turn) -> StageSpec:
+    return StageSpec(name=name, offset=_GOOGLE_OFFSET, turn=turn, solid=False)
 
 
 # Upstream turns and shifts two of them: a pose times the quaternion (0.707, 0.707, 0, 0), which puts a mesh upright.
-ROOMS: Mapping[str, Stage] = MappingProxyType(
+ROOMS: Mapping[str, StageSpec] = MappingProxyType(
     {
         "frl_apartment_stage_simple": _room("frl_apartment_stage_simple"),
         "modern_bedroom_no_roof": _room(

@@ -1,7 +1,7 @@
 """One episode of SIMPLER's evaluation lists as data, and what a task's episodes have in common.
 
 ``EpisodeSpec`` says everything that upstream's evaluation loop (SimplerEnv commit 4ab7178,
-``simpler_env/evaluation/maniskill2_evaluator.py``) fixes of an episode. ``published.py`` has the lists.
+``simpler_env/evaluation/maniskill2_evaluator.py``) fixes of an episode. ``lists.py`` has the lists.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from typing import Any
 
 from vecenv.simpler.control.robots import GOOGLE_ROBOT
 from vecenv.simpler.layouts import Choices
-from vecenv.simpler.tasks import COKE_TABLE, TASKS, SimplerTask
+from vecenv.simpler.task_spec import SimplerTask
+from vecenv.simpler.task_table import COKE_TABLE
+from vecenv.simpler.tasks import TASKS
 from vecenv.simpler.variants import Variant
 
 VISUAL_MATCHING, VARIANT_AGGREGATION, SEED = "visual-matching", "variant-aggregation", "seed"

@@ -1,7 +1,7 @@
 """The sweeps of upstream's scripts, loop by loop: the episodes of visual matching and of variant aggregation.
 
 In: a task. Out: its ``EpisodeSpec``s in the order in which the scripts (SimplerEnv commit 4ab7178, ``scripts/``) run
-them for one checkpoint; numbers are given by ``published.py``.
+them for one checkpoint; ``lists.py`` numbers them.
 """
 
 from __future__ import annotations
@@ -14,16 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.simpler.layouts import (
-    DRAWER_STATIONS,
-    MOVE_NEAR_STATION,
-    PICK_STATION,
-    Station,
-    num_arrangements,
-    put_on_station,
-    stand,
-    unseeded_seeds,
-)
+from vecenv.simpler.layouts import num_arrangements, unseeded_seeds
 from vecenv.simpler.published.specs import (
     COKE_ENVIRONMENT,
     MOVE_NEAR_ENVIRONMENT,
@@ -33,7 +24,8 @@ from vecenv.simpler.published.specs import (
     EpisodeSpec,
     common_fields,
 )
-from vecenv.simpler.tasks import SimplerTask
+from vecenv.simpler.stations import DRAWER_STATIONS, MOVE_NEAR_STATION, PICK_STATION, Station, put_on_station, stand
+from vecenv.simpler.task_spec import SimplerTask
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Grids.

@@ -1,10 +1,10 @@
-"""Many slots: scenes side by side in this process, or spread over worker processes.
+"""The physics of a batch: scenes in this process, or spread over worker processes.
 
 In: which scene and start a slot gets, and set-points of all slots, [B, substeps, dof]. Out: ``facts``, one row of
-``scenes.facts_dtype`` a slot, and ``faults``; and pictures. A PhysX step in SAPIEN holds Python's lock, so threads
-would not help: several processes are what uses several cores. Set-points and facts lie in memory that all of them
-share; what is sent is a few bytes a tick. Pictures are drawn where their slots are, into memory that is made for them.
-Workers are started as a module, so the caller's script is not imported again.
+``physics.spec.facts_dtype`` a slot, ``faults``, and images. A PhysX step in SAPIEN holds Python's lock, so several
+processes and not threads use several cores. Set-points and facts lie in shared memory, so a message is a few bytes a
+tick. Each process renders its own slots, into shared memory that is allocated for the images. Workers are started as a
+module, so the caller's script is not imported again.
 """
 
 from __future__ import annotations
@@ -19,20 +19,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing import reduction
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from vecenv.errors import SimulationError
-from vecenv.simpler.physics.scenes import Scene, SceneSpec, Start, facts_dtype
+from vecenv.simpler.overlay import ImageBuffer, Images, Renderer, RendererMissing, RenderStyle, RenderSubject
+from vecenv.simpler.physics.scenes import Scene
+from vecenv.simpler.physics.spec import SceneSpec, Start, facts_dtype
 
-if TYPE_CHECKING:
-    from vecenv.simpler.overlay import Canvas, Painter, Pictures, Style, Subject
+# Slot -> what to render, and a row of facts.
+Orders: TypeAlias = Mapping[int, tuple[RenderSubject, np.void]]
 
-# What is to be seen in each slot, and a row of facts.
-Orders: TypeAlias = "Mapping[int, tuple[Subject, np.void]]"
-
-# Scenes that no slot uses at present, kept for when one is wanted again.
+# Unused scenes that are kept for later episodes.
 _SPARE = 8
 
 
@@ -51,7 +50,7 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """How large the shared arrays are: B slots, substeps a tick, joints, objects."""
+    """Sizes of the shared arrays: B slots, substeps per tick, joints, objects."""
 
     slots: int
     substeps: int
@@ -60,10 +59,10 @@ class Sizes:
 
     @property
     def bytes(self) -> int:
-        """Of all arrays together."""
+        """Size of all arrays together, bytes."""
         return self.slots * (facts_dtype(self.dof, self.objects).itemsize + 2 * 8 * self.substeps * self.dof)
 
-    def arrays(self, memory: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def arrays(self, memory: mmap.mmap | bytearray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Facts [B], set-points of positions and of velocities [B, S, N], over a buffer."""
         dtype, count = facts_dtype(self.dof, self.objects), self.slots * self.substeps * self.dof
         shape, begin = (self.slots, self.substeps, self.dof), self.slots * dtype.itemsize
@@ -73,7 +72,7 @@ class Sizes:
 
 
 class Slots(Protocol):
-    """What both ways of running slots offer."""
+    """Physics of a batch, in this process or in workers."""
 
     facts: np.ndarray
     faults: list[str]
@@ -83,11 +82,11 @@ class Slots(Protocol):
         ...
 
     def run(self, active: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> None:
-        """One control tick of the slots in ``active`` (bool [B]); ``facts`` and ``faults`` then hold what came out."""
+        """One control tick of the slots in ``active`` (bool [B]); ``facts`` and ``faults`` then hold the results."""
         ...
 
-    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
-        """Pictures of the slots in ``orders``, each of a subject in a state (a row of facts); the others are 0.
+    def draw(self, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
+        """Images of the slots in ``orders``, each of a subject in a state (a row of facts); the others are 0.
 
         Raises:
             RendererMissing: no Vulkan driver.
@@ -115,12 +114,12 @@ class LocalSlots:
         memory: buffer that they lie in; None for memory of their own.
     """
 
-    def __init__(self, sizes: Sizes, memory: Any = None) -> None:
+    def __init__(self, sizes: Sizes, memory: mmap.mmap | None = None) -> None:
         self.facts, self._position, self._velocity = sizes.arrays(bytearray(sizes.bytes) if memory is None else memory)
         self.faults = [""] * sizes.slots
         self._scenes: dict[int, Scene] = {}
         self._spare: list[Scene] = []
-        self._painter: Painter | None = None
+        self._renderer: Renderer | None = None
 
     def begin(self, jobs: Sequence[Job]) -> dict[int, np.ndarray]:
         """See ``Slots``."""
@@ -157,20 +156,18 @@ class LocalSlots:
         active[list(slots)] = True
         self.run(active, self._position, self._velocity)
 
-    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+    def draw(self, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
         """See ``Slots``."""
-        return self.draw_into(mmap.mmap(-1, canvas.bytes), style, canvas, orders)
+        return self.draw_into(mmap.mmap(-1, buffer.bytes), style, buffer, orders)
 
-    def draw_into(self, memory: mmap.mmap, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+    def draw_into(self, memory: mmap.mmap, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
         """``draw`` over a buffer."""
-        from vecenv.simpler.overlay import Painter
-
-        if self._painter is None or self._painter.style != style:
-            self._painter = Painter(style)
-        pictures = canvas.pictures(memory)
+        if self._renderer is None or self._renderer.style != style:
+            self._renderer = Renderer(style)
+        images = buffer.images(memory)
         for slot, (subject, facts) in orders.items():
-            self._painter.paint(subject, facts, pictures.of(slot))
-        return pictures
+            self._renderer.render(subject, facts, images.of(slot))
+        return images
 
     def state(self) -> list[np.ndarray]:
         """See ``Slots``."""
@@ -186,8 +183,8 @@ class LocalSlots:
         """See ``Slots``."""
         self._scenes.clear()
         self._spare.clear()
-        if self._painter is not None:
-            self._painter.close()
+        if self._renderer is not None:
+            self._renderer.close()
 
 
 class ProcessSlots:
@@ -216,8 +213,8 @@ class ProcessSlots:
             shares.setdefault(self._owner(int(slot)), []).append(int(slot))
         return shares
 
-    def _ask(self, asked: dict[int, tuple[str, Any]], handle: int | None = None) -> dict[int, Any]:
-        """Send every worker its request, and a file handle if there is one; then collect every answer."""
+    def _ask(self, asked: Mapping[int, tuple[str, object]], handle: int | None = None) -> dict[int, Any]:
+        """Send every worker its request, with a file handle if given; then collect every answer."""
         for index, request in asked.items():
             self._workers[index].send(request, handle)
         received = {index: self._workers[index].receive() for index in asked}
@@ -246,20 +243,20 @@ class ProcessSlots:
         shares = self._share(np.flatnonzero(active).tolist())
         self._ask({i: ("run", slots) for i, slots in shares.items()})
 
-    def draw(self, style: Style, canvas: Canvas, orders: Orders) -> Pictures:
+    def draw(self, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> Images:
         """See ``Slots``."""
-        handle = os.memfd_create("vecenv-simpler-pictures")
+        handle = os.memfd_create("vecenv-simpler-images")
         try:
-            os.ftruncate(handle, canvas.bytes)
-            memory = mmap.mmap(handle, canvas.bytes)
+            os.ftruncate(handle, buffer.bytes)
+            memory = mmap.mmap(handle, buffer.bytes)
             shares = self._share(list(orders))
             asked = {
-                i: ("draw", (style, canvas, {slot: orders[slot] for slot in slots})) for i, slots in shares.items()
+                i: ("draw", (style, buffer, {slot: orders[slot] for slot in slots})) for i, slots in shares.items()
             }
             self._ask(asked, handle)
         finally:
             os.close(handle)
-        return canvas.pictures(memory)
+        return buffer.images(memory)
 
     def state(self) -> list[np.ndarray]:
         """See ``Slots``."""
@@ -285,20 +282,20 @@ class ProcessSlots:
 
 
 class _Worker:
-    """One process, and the pipe to it."""
+    """A worker process and the pipe to it."""
 
     def __init__(self, sizes: Sizes, memory: int, environment: dict[str, str]) -> None:
         mine, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "vecenv.simpler.physics.workers", str(theirs.fileno()), str(memory)],
+                [sys.executable, "-m", "vecenv.simpler.workers", str(theirs.fileno()), str(memory)],
                 pass_fds=(theirs.fileno(), memory),
                 env=environment,
             )
         self._pipe = Connection(mine.detach())
         self.send(sizes)
 
-    def send(self, message: Any, handle: int | None = None) -> None:
+    def send(self, message: object, handle: int | None = None) -> None:
         try:
             self._pipe.send(message)
             if handle is not None:
@@ -307,7 +304,7 @@ class _Worker:
             raise self._gone() from error
 
     def receive(self) -> tuple[bool, Any]:
-        """Whether it worked, and the answer or else what ``_sent`` made of the error."""
+        """Whether the request succeeded, and its answer, or the error as ``_sendable`` returns it."""
         try:
             return self._pipe.recv()
         except (EOFError, OSError) as error:
@@ -326,7 +323,7 @@ class _Worker:
 
 
 def _environment(workers: int) -> dict[str, str]:
-    """A worker's: the module search path of this process, one thread for numerics, its share of the cores for Mesa."""
+    """A worker's environment: this process's module path, one thread for numerics, its share of the cores for Mesa."""
     paths = [path for path in sys.path if path]
     cores = max(1, len(os.sched_getaffinity(0)) // workers)
     own = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
@@ -339,7 +336,7 @@ def make_slots(sizes: Sizes, workers: int) -> LocalSlots | ProcessSlots:
 
 
 def _serve(pipe: Connection, memory: int) -> None:
-    """A worker's life: requests until the pipe closes."""
+    """A worker's main loop: answer requests until the pipe closes."""
     sizes: Sizes = pipe.recv()
     local = LocalSlots(sizes, mmap.mmap(memory, sizes.bytes))
     calls = {
@@ -358,26 +355,24 @@ def _serve(pipe: Connection, memory: int) -> None:
         try:
             answer = calls[name](argument)
         except Exception as error:
-            pipe.send((False, _sent(error)))
+            pipe.send((False, _sendable(error)))
             continue
         changed = {slot: fault for slot, fault in enumerate(local.faults) if known.get(slot, "") != fault}
         known.update(changed)
         pipe.send((True, (changed, answer)))
 
 
-def _draw(local: LocalSlots, pipe: Connection, style: Style, canvas: Canvas, orders: Orders) -> None:
+def _draw(local: LocalSlots, pipe: Connection, style: RenderStyle, buffer: ImageBuffer, orders: Orders) -> None:
     """Draw into the memory whose handle follows the request."""
     handle = reduction.recv_handle(pipe)
     try:
-        local.draw_into(mmap.mmap(handle, canvas.bytes), style, canvas, orders)
+        local.draw_into(mmap.mmap(handle, buffer.bytes), style, buffer, orders)
     finally:
         os.close(handle)
 
 
-def _sent(error: Exception) -> Exception | str:
-    """What the caller gets of an error: its traceback, or itself when it says that there is no driver."""
-    from vecenv.simpler.overlay import RendererMissing
-
+def _sendable(error: Exception) -> Exception | str:
+    """An error as it is sent to the caller: ``RendererMissing`` itself, else the traceback."""
     return error if isinstance(error, RendererMissing) else traceback.format_exc()
 
 
