@@ -23,8 +23,8 @@ import numpy as np
 
 from vecenv.errors import InvalidInput
 from vecenv.libero.physics.base import Group, Start
-from vecenv.libero.scene import cache
 from vecenv.libero.scene.scene import CONTACT_LIMIT, PAIR_LIMIT, Scene
+from vecenv.util import caching
 
 # Factors on the most that was seen. Two boxes of published contacts have up to eight, and how many changes from substep
 # to substep while fingers press: 1.3 times the rows were too few for libero_10 task 0 (5 of 10 episodes of pick_place).
@@ -149,16 +149,16 @@ def _grasping(scene: Scene, group: Group) -> Iterator[np.ndarray]:
 
 def cached(scene: Scene, starts: Start) -> Budget:
     """``measure``, remembered in the user's cache folder; the key is the model, the starts and how it is measured."""
-    folder = cache.folder()
+    folder = caching.folder("budgets")
     if folder is None:
         return measure(scene, starts)
-    path = folder.with_name("budgets") / f"{_key(scene.model, starts)}.json"
+    path = folder / f"{_key(scene.model, starts)}.json"
     with contextlib.suppress(OSError, ValueError, TypeError):
         return Budget(**json.loads(path.read_bytes()))
     budget = measure(scene, starts)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        cache.write_file(path, json.dumps(asdict(budget)).encode())
+        caching.write_file(path, json.dumps(asdict(budget)).encode())
     return budget
 
 

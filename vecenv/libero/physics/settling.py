@@ -18,9 +18,9 @@ import numpy as np
 
 from vecenv.errors import SimulationError
 from vecenv.libero.physics.base import SETTLE_ACTION, SETTLE_TICKS, Start
-from vecenv.libero.scene import cache
 from vecenv.libero.scene.scene import Scene
 from vecenv.libero.tasks.settled import TIME
+from vecenv.util import caching
 
 # Part of the key: raised when what is computed changes.
 VERSION = 1
@@ -95,8 +95,8 @@ def _keys(model: mujoco.MjModel, starts: Start) -> list[str]:
 
 
 def _path(key: str) -> Path | None:
-    folder = cache.folder()
-    return None if folder is None else folder.with_name("settled") / f"{key}.npy"
+    folder = caching.folder("settled")
+    return None if folder is None else folder / f"{key}.npy"
 
 
 def _read(key: str, width: int) -> np.ndarray | None:
@@ -116,4 +116,4 @@ def _write(key: str, state: np.ndarray) -> None:
     np.save(buffer, state)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        cache.write_file(path, buffer.getvalue())
+        caching.write_file(path, buffer.getvalue())

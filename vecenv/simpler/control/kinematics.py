@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from numba import types
 
 from vecenv.errors import InvalidInput
+from vecenv.util.compiled import compile_function, part
 
 
 class KinematicsError(InvalidInput):
@@ -375,26 +375,15 @@ _R1, _R2, _R3 = (types.Array(types.float64, n, "C", readonly=True) for n in (1, 
 _W2, _W3 = (types.Array(types.float64, n, "C") for n in (2, 3))
 _FLAGS, _WRITE_FLAGS = types.Array(types.boolean, 1, "C", readonly=True), types.Array(types.boolean, 1, "C")
 _CHAIN = (types.Array(types.intp, 1, "C", readonly=True), _R2, _R3, _R2, _FLAGS)
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-# What only compiled code calls needs no entry from Python or C.
-_INNER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_part = numba.njit(**_INNER)
 
 
 @functools.cache
 def _compiled() -> tuple[Callable[..., None], Callable[..., None]]:
     """``_forward`` and ``_inverse``, compiled."""
     return (
-        _compile(types.void(*_CHAIN, _R1, _R2, _R2, _W2, _W3, _W3), _forward),
-        _compile(types.void(*_CHAIN, _R2, _R3, _R1, types.intp, _W2, _WRITE_FLAGS), _inverse),
+        compile_function(types.void(*_CHAIN, _R1, _R2, _R2, _W2, _W3, _W3), _forward),
+        compile_function(types.void(*_CHAIN, _R2, _R3, _R1, types.intp, _W2, _WRITE_FLAGS), _inverse),
     )
-
-
-def _compile(signature: Any, function: Callable[..., None]) -> Callable[..., None]:
-    try:
-        return numba.njit([signature], cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # numba finds no folder that it may write
-        return numba.njit([signature], **_OPTIONS)(function)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -460,7 +449,7 @@ def _inverse(
                     qpos[i, columns[j]] -= numbers[2] * total
 
 
-@_part
+@part
 def _follow(
     columns: Any,
     fixed_pos: Any,
@@ -493,14 +482,14 @@ def _follow(
             origins[j, row] = frame[3, row]
 
 
-@_part
+@part
 def _attach(frame: Any, position: Any, rotation: Any) -> None:
     for row in range(3):
         frame[3, row] += frame[row, 0] * position[0] + frame[row, 1] * position[1] + frame[row, 2] * position[2]
     _turn(frame, rotation)
 
 
-@_part
+@part
 def _turn(frame: Any, rotation: Any) -> None:
     for row in range(3):
         a, b, c = frame[row, 0], frame[row, 1], frame[row, 2]
@@ -508,7 +497,7 @@ def _turn(frame: Any, rotation: Any) -> None:
             frame[row, column] = a * rotation[0, column] + b * rotation[1, column] + c * rotation[2, column]
 
 
-@_part
+@part
 def _rotation_about(axis: Any, angle: float, out: Any) -> None:
     """Rodrigues' formula."""
     x, y, z = axis[0], axis[1], axis[2]
@@ -519,7 +508,7 @@ def _rotation_about(axis: Any, angle: float, out: Any) -> None:
     out[2, 0], out[2, 1], out[2, 2] = z * x * d - y * s, z * y * d + x * s, c + z * z * d
 
 
-@_part
+@part
 def _fill_jacobian(frame: Any, origins: Any, axes: Any, slides: Any, out: Any) -> None:
     """Linear and angular velocity of the frame's origin, root axes."""
     for j in range(slides.size):
@@ -533,7 +522,7 @@ def _fill_jacobian(frame: Any, origins: Any, axes: Any, slides: Any, out: Any) -
             out[3, j], out[4, j], out[5, j] = ax, ay, az
 
 
-@_part
+@part
 def _pose_error(frame: Any, target_pos: Any, target_rot: Any, error: Any) -> float:
     """Twist that takes the target to the frame in unit time, in root axes at the frame's origin; and its length.
 
@@ -567,7 +556,7 @@ def _pose_error(frame: Any, target_pos: Any, target_rot: Any, error: Any) -> flo
     return math.sqrt(u * u + v * v + t * t + x * x + y * y + z * z)
 
 
-@_part
+@part
 def _quaternion_between(frame: Any, target_rot: Any) -> tuple[float, float, float, float]:
     """Unit quaternion with w >= 0 of target_rotᵀ frame; Shepperd's method, as in ``controllers/rotations.py``."""
     m = np.empty((3, 3))
@@ -594,7 +583,7 @@ def _quaternion_between(frame: Any, target_rot: Any) -> tuple[float, float, floa
     return w / length, x / length, y / length, z / length
 
 
-@_part
+@part
 def _damped_system(jacobian: Any, damping: float, out: Any) -> None:
     """J Jᵀ + damping."""
     for row in range(6):
@@ -605,7 +594,7 @@ def _damped_system(jacobian: Any, damping: float, out: Any) -> None:
             out[row, column] = out[column, row] = total
 
 
-@_part
+@part
 def _solve_in_place(system: Any, right: Any) -> None:
     """Solve a positive definite system by its LDLᵀ factorisation; both arguments are overwritten."""
     n = right.size

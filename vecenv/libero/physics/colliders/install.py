@@ -27,7 +27,7 @@ from numba.core import cgutils
 from vecenv.errors import SimulationError
 from vecenv.libero.physics.colliders import boxbox, planemesh
 from vecenv.libero.scene.contacts import MARK, mark
-from vecenv.util.compiled import address_at, builtin, compile_for_c, floats_at, int32_at, part
+from vecenv.util.compiled import address_at, compile_for_c, floats_at, int32_at, intrinsic_with_literals, part
 
 _PLANE, _BOX, _MESH = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "BOX", "MESH"))
 _GEOM_TYPES = int(mujoco.mjtGeom.mjGEOM_SDF) + 1
@@ -194,7 +194,7 @@ def _compiled() -> tuple[Any, Any]:
     return compile_for_c(signature, _box_box), compile_for_c(signature, _plane_mesh)
 
 
-@builtin
+@intrinsic_with_literals
 def _layout(typingctx: Any, index: Any) -> Any:
     """An entry of ``_LAYOUT``."""
 
@@ -207,7 +207,7 @@ def _layout(typingctx: Any, index: Any) -> Any:
     return types.uintp(types.int64), codegen
 
 
-@builtin
+@intrinsic_with_literals
 def _call(typingctx: Any, function: Any, arguments: Any) -> Any:
     """Call a C function that returns an int32 by its address, with a tuple of arguments."""
 
