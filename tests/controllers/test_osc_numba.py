@@ -20,7 +20,7 @@ from vecenv.controllers import gripper, osc
 from vecenv.controllers.gripper import GripperConfig
 from vecenv.controllers.osc import OscConfig
 from vecenv.controllers.osc_numba import ArmViews, Controllers
-from vecenv.libero.physics.mjx import backend as mjx
+from vecenv.libero.physics.mjx.options import compiler_options
 from vecenv.libero.physics.native import arm_views, home_row
 from vecenv.libero.scene.scene import Scene, compile_scene
 from vecenv.libero.tasks.suites import task
@@ -29,7 +29,7 @@ from vecenv.util.compiled import compile_function
 COUNT = 1000
 EVERYONE = np.ones(COUNT, bool)
 # Parity does not need LLVM's optimisation, and things compile several times faster without.
-OPTIONS: dict[str, Any] = {**mjx.compiler_options(), "xla_backend_optimization_level": 0}
+OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level": 0}
 jax_set_goal, jax_torques = (
     partial(jax.jit, static_argnames="config", compiler_options=OPTIONS)(f) for f in (osc.set_goal, osc.torques)
 )

@@ -40,8 +40,11 @@ from vecenv.libero.physics import budgets
 from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS
 from vecenv.libero.physics.base import Start as PhysicsStart
 from vecenv.libero.physics.budgets import Budget
-from vecenv.libero.physics.mjx import backend as mjx_physics
-from vecenv.libero.physics.mjx.backend import System, World, jit
+from vecenv.libero.physics.mjx import model as mjx_model
+from vecenv.libero.physics.mjx import step as mjx_step
+from vecenv.libero.physics.mjx.model import System
+from vecenv.libero.physics.mjx.options import jit
+from vecenv.libero.physics.mjx.step import World
 from vecenv.libero.render.options import COLORS, LARGEST_SIDE, POLICY_CAMERAS
 from vecenv.libero.render.raytrace import RayTracer
 from vecenv.libero.render.scenery import Scenery, installed_scenery
@@ -194,7 +197,7 @@ class Data:
         xpos: body positions, world frame, metres, [nbody, 3]. xquat: body orientations, wxyz, [nbody, 4].
         geom_xpos: [ngeom, 3]. geom_xmat: [ngeom, 3, 3]; warp computes those of fixtures only when an episode begins.
         site_xpos: [nsite, 3]. site_xmat: [nsite, 3, 3]. sensordata: contact sensors, [nsensordata].
-        world: fixture poses, controller memory, proprioception and faults (``vecenv.libero.physics.mjx.backend.World``,
+        world: fixture poses, controller memory, proprioception and faults (``vecenv.libero.physics.mjx.step.World``,
         no ``data``).
         start_height: height of the target's origin when the episode began, metres.
     """
@@ -320,10 +323,10 @@ class _Physics:
         action: a key of ``ACTIONS``.
     """
 
-    def __init__(self, built: mjx_physics.Build, action: str) -> None:
+    def __init__(self, built: mjx_model.Build, action: str) -> None:
         self._built = built
         limits = built.scene.model.jnt_range[:7].T.astype(np.float32)
-        self._act = mjx_physics.control_step if action == "osc" else functools.partial(joint_step, limits=limits)
+        self._act = mjx_step.control_step if action == "osc" else functools.partial(joint_step, limits=limits)
         self._blanks: dict[int, Callable[[], mjx.Data]] = {}
         # Only warp's contact memory is shared by a batch, and only jax can be differentiated.
         sized = built.impl == "warp"
@@ -347,9 +350,9 @@ class _Physics:
 
     def _begin(self, blank: mjx.Data, model: mjx.Model, start: Begin) -> Data:
         system = self._system(model)
-        world = mjx_physics.new_world(system, blank)._replace(body_pos=start.body_pos, body_quat=start.body_quat)
+        world = mjx_step.new_world(system, blank)._replace(body_pos=start.body_pos, body_quat=start.body_quat)
         time = jnp.asarray(settled_starts.TIME, start.qpos.dtype)
-        return _kept(mjx_physics.start_world(system, world, start.qpos, start.qvel, time, jnp.asarray(True)))
+        return _kept(mjx_step.start_world(system, world, start.qpos, start.qvel, time, jnp.asarray(True)))
 
     def _advance(self, blank: mjx.Data, model: mjx.Model, data: Data, action: jax.Array) -> Data:
         full = blank.replace(**{name: getattr(data, name) for name in _PHYSICS})
@@ -387,12 +390,12 @@ def _joint_step(system: System, world: World, action: jax.Array, limits: jax.Arr
         seen = (*kinematics.hand_pose(system.chain, robot), robot[7:])
         fingers = gripper_control.integrate(fingers, action[7])
         ctrl = jnp.concatenate([joint_control.torques(arm, goal), gripper_control.command(fingers)])
-        data = mjx_physics.substep(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
-        return (data, fingers, fault | mjx_physics._overflow(data)), seen
+        data = mjx_step.substep(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
+        return (data, fingers, fault | mjx_step.overflow_bits(data)), seen
 
     carry = (world.data, world.gripper, jnp.zeros((), jnp.int32))
     (data, fingers, fault), (pos, quat, finger_pos) = lax.scan(advance, carry, None, SUBSTEPS)
-    fault = fault | jnp.where(mjx_physics._stable(data), 0, mjx_physics._UNSTABLE)
+    fault = fault | jnp.where(mjx_step.is_stable(data), 0, mjx_step.UNSTABLE)
     return world._replace(
         data=data,
         gripper=fingers,
@@ -442,8 +445,8 @@ class LiberoEnv:
         sharing = _sharing(sources, problem)
         self.scene = _with_cone(_scene(source, sharing, self.config), CONES[self.config.cone])
         budget = self.config.budget or _measured(self.scene, sharing)
-        iterations = self.config.iterations or mjx_physics.usual_iterations(self.config.impl, self.config.geometry)
-        built = mjx_physics.build(self.scene, impl=self.config.impl, budget=budget, iterations=iterations)
+        iterations = self.config.iterations or mjx_model.usual_iterations(self.config.impl, self.config.geometry)
+        built = mjx_model.build(self.scene, impl=self.config.impl, budget=budget, iterations=iterations)
         self.impl, self.budget = built.impl, budget
         self._physics = _Physics(built, self.config.action)
         # Playground's wrapper for domain randomisation puts another model here while it traces.

@@ -137,7 +137,7 @@ class Group(Protocol):
 
 
 @dataclass(frozen=True)
-class Ran:
+class RunResult:
     """What ``run`` and ``follow`` did.
 
     Attributes:
@@ -152,7 +152,7 @@ class Ran:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Followed(Ran):
+class FollowResult(RunResult):
     """What ``follow`` did.
 
     Attributes:
@@ -262,7 +262,7 @@ class Physics(ABC):
         watchers: Sequence[Watcher] = (),
         *,
         until_success: bool = True,
-    ) -> Ran:
+    ) -> RunResult:
         """Execute a chunk of actions; a slot stops at its own success, fault or limit.
 
         Args:
@@ -276,7 +276,7 @@ class Physics(ABC):
         for k in range(chunk.shape[1]):
             if not loop.tick(chunk[:, k]).any():
                 break
-        return Ran(ticks=loop.ticks, success=loop.success, solved=loop.solved)
+        return RunResult(ticks=loop.ticks, success=loop.success, solved=loop.solved)
 
     def follow(
         self,
@@ -288,7 +288,7 @@ class Physics(ABC):
         max_misses: int | None = None,
         watchers: Sequence[Watcher] = (),
         until_success: bool = True,
-    ) -> Followed:
+    ) -> FollowResult:
         """Follow plans; a slot stops at the end of its plan and at its own success, fault or limit.
 
         Args:
@@ -311,7 +311,7 @@ class Physics(ABC):
             actions, progress = follower.action(plan, progress, self.eef())
             moved = loop.tick(np.asarray(actions), going)
             progress = follower.advance(plan, progress, self.eef(), moved)
-        return Followed(
+        return FollowResult(
             ticks=loop.ticks,
             success=loop.success,
             solved=loop.solved,
