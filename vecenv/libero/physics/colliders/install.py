@@ -25,7 +25,7 @@ from numba import types
 from numba.core import cgutils
 
 from vecenv.errors import SimulationError
-from vecenv.libero.physics.colliders import boxbox, planemesh
+from vecenv.libero.physics.colliders import boxbox, boxbox_numba, planemesh
 from vecenv.libero.scene.contacts import MARK, mark
 from vecenv.util.compiled import address_at, compile_for_c, floats_at, int32_at, intrinsic_with_literals, part
 
@@ -74,7 +74,7 @@ def install() -> None:
         boxes, meshes = table[_BOX][_BOX], table[_PLANE][_MESH]
         if not boxes or not meshes:
             raise _unknown("its collision table has no collider for two boxes, or none for a mesh on a plane")
-        ours = boxbox.compiled().address, planemesh.compiled().address
+        ours = boxbox_numba.compiled().address, planemesh.compiled().address
         entries = [boxes, meshes, *ours, int(np.float64(MARK).view(np.int64)), *_offsets()]
         _LAYOUT[: len(entries)] = entries
         llvm.add_symbol(_SYMBOL, _LAYOUT.ctypes.data)
