@@ -182,7 +182,7 @@ class MjxPhysics(Physics):
         return out
 
     def set_goals(self, tables: Sequence[goals.GoalTable]) -> None:
-        """The goals of the slots, one table a group, rows in the order of its slots."""
+        """Set the goals of the slots: one table a group, rows in the order of its slots."""
         super().set_goals(tables)
         for group, table in zip(self._groups, tables, strict=True):
             group.table = jax.tree.map(group.put, table)
