@@ -28,7 +28,9 @@ from mujoco import mjx
 import vecenv
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.physics.base import SUBSTEPS
-from vecenv.libero.physics.mjx.backend import MjxGroup, World, control_step, jit
+from vecenv.libero.physics.mjx.backend import MjxGroup
+from vecenv.libero.physics.mjx.options import jit
+from vecenv.libero.physics.mjx.step import World, control_step
 from vecenv.libero.scene.contacts import CONTACTS
 
 CHUNK = 10

@@ -3,7 +3,7 @@
 The rows: the batched environment on ``impl="jax"`` with lean geometry against the native backend on the same scene
 and actions, in alternation, and the processor time of all cores that a step takes, which others' work changes little.
 Beside them in the file, "fusion trap": a function compiled with the options of
-``vecenv.libero.physics.mjx.backend.compiler_options`` and without; and "compile": seconds to trace and to compile a
+``vecenv.libero.physics.mjx.options.compiler_options`` and without; and "compile": seconds to trace and to compile a
 chunk of control steps in a process with empty caches, and in a second process that finds them.
 """
 
@@ -144,7 +144,8 @@ def trap(options: argparse.Namespace) -> dict[str, Any]:
     from mjx import alternate
     from mujoco import mjx
 
-    from vecenv.libero.physics.mjx.backend import compiler_options, substep
+    from vecenv.libero.physics.mjx.options import compiler_options
+    from vecenv.libero.physics.mjx.step import substep
 
     (scene,), (name,) = options.scene, options.function
     (group,) = ready_env(scene, "jax", 1).physics.groups

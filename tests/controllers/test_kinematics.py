@@ -15,12 +15,12 @@ import pytest
 from vecenv.controllers import osc
 from vecenv.controllers.chain import chain_from_model
 from vecenv.controllers.kinematics import Chain, arm_state, hand_pose
-from vecenv.libero.physics.mjx import backend as mjx
+from vecenv.libero.physics.mjx.options import compiler_options
 from vecenv.libero.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, HAND_BODY, HOME_QPOS, panda_chain
 from vecenv.libero.tasks.sources import installed_tasks
 
 # The options the library uses, and the same without LLVM's optimisation, which compile 5 times faster.
-OPTIONS = mjx.compiler_options()
+OPTIONS = compiler_options()
 UNOPTIMISED: dict[str, Any] = {**OPTIONS, "xla_backend_optimization_level": 0}
 optimised, compiled = (partial(jax.jit, compiler_options=options) for options in (OPTIONS, UNOPTIMISED))
 # States of most tests: functions of as many compile once.

@@ -12,10 +12,10 @@ import pytest
 from support.robosuite_peer import SUBSTEPS, RobosuitePeer, Rollout, arm_from_rows, believed, goal_of
 
 from vecenv.controllers import osc
-from vecenv.libero.physics.mjx import backend as mjx
+from vecenv.libero.physics.mjx.options import compiler_options
 
 # Without LLVM's optimisation things compile several times faster; where a test says nothing of speed and rounding.
-OPTIONS: dict[str, Any] = {**mjx.compiler_options(), "xla_backend_optimization_level": 0}
+OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level": 0}
 compiled = partial(jax.jit, compiler_options=OPTIONS)
 # Arms of the parity tests, and substeps of the rollout: functions of as many slots compile once.
 COUNT = 1000

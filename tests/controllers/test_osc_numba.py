@@ -16,19 +16,20 @@ from mujoco.batch import Batch
 from numba import types
 from support.robosuite_peer import RobosuitePeer, Rollout, arm_from_rows, believed, views_of
 
-from vecenv.controllers import gripper, osc, osc_numba
+from vecenv.controllers import gripper, osc
 from vecenv.controllers.gripper import GripperConfig
 from vecenv.controllers.osc import OscConfig
 from vecenv.controllers.osc_numba import ArmViews, Controllers
-from vecenv.libero.physics.mjx import backend as mjx
+from vecenv.libero.physics.mjx.options import compiler_options
 from vecenv.libero.physics.native import arm_views, home_row
 from vecenv.libero.scene.scene import Scene, compile_scene
 from vecenv.libero.tasks.suites import task
+from vecenv.util.compiled import compile_function
 
 COUNT = 1000
 EVERYONE = np.ones(COUNT, bool)
 # Parity does not need LLVM's optimisation, and things compile several times faster without.
-OPTIONS: dict[str, Any] = {**mjx.compiler_options(), "xla_backend_optimization_level": 0}
+OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level": 0}
 jax_set_goal, jax_torques = (
     partial(jax.jit, static_argnames="config", compiler_options=OPTIONS)(f) for f in (osc.set_goal, osc.torques)
 )
@@ -339,4 +340,4 @@ def test_code_that_no_cache_can_hold_is_compiled_all_the_same() -> None:
     """numba refuses to cache where it finds no folder to write to, or no file at all, as here."""
     space: dict[str, Any] = {}
     exec("def twice(x):\n    return 2 * x", space)
-    assert osc_numba._compile(types.float64(types.float64), space["twice"])(21.0) == 42.0
+    assert compile_function(types.float64(types.float64), space["twice"])(21.0) == 42.0

@@ -13,7 +13,7 @@ import pytest
 from vecenv.libero import functional
 from vecenv.libero.functional import FunctionalError
 from vecenv.libero.physics.budgets import Budget
-from vecenv.libero.physics.mjx import backend as mjx
+from vecenv.libero.physics.mjx.options import compiler_options
 
 pytest.importorskip("mujoco_playground")
 
@@ -25,7 +25,7 @@ NAME = "Libero/libero_object/0"
 WORLDS = 3
 # What vecenv.libero.physics.budgets measures for this scene.
 BUDGET = Budget(contacts=90, rows=285, pairs=71, candidates=237)
-OPTIONS: dict[str, Any] = {**mjx.compiler_options(), "xla_backend_optimization_level": 0}
+OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level": 0}
 compiled = functools.partial(jax.jit, compiler_options=OPTIONS)
 
 

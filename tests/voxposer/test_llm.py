@@ -21,7 +21,7 @@ from support.llm_server import HANG, Answer, LlmServer, code, failure, serving
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
 
-from voxposer.language import llm as module
+from vecenv.util import caching
 from voxposer.language.llm import Llm, LlmConfig, LlmError, ReplyCache, ReplyError, Usage
 
 # Of a library that litellm uses.
@@ -46,7 +46,7 @@ def server(running: LlmServer) -> LlmServer:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache of this test's own."""
-    monkeypatch.setenv(module.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path))
     return tmp_path / "llm"
 
 
@@ -309,7 +309,7 @@ def test_the_cache_can_be_turned_off(
 ) -> None:
     model = Model(replace(config, cache=False))
     assert [model.complete(QUESTION).cached for _ in range(2)] == [False, False]
-    monkeypatch.setenv(module.VARIABLE, "")
+    monkeypatch.setenv(caching.VARIABLE, "")
     Model(config).complete(QUESTION)
     assert not folder.exists()
 

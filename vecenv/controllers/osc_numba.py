@@ -23,6 +23,7 @@ from numba import types
 
 from vecenv.controllers.gripper import PANDA_GRIPPER, GripperConfig
 from vecenv.controllers.osc import NUM_JOINTS, OSC_POSE, OscConfig
+from vecenv.util.compiled import compile_function, part
 
 # Fields of an arm written as one row, in order, with their widths.
 ARM_FIELDS = {
@@ -221,27 +222,15 @@ _COMMON = (
     types.Array(numba.from_dtype(_WORK), 1, "C"),
     types.Array(types.boolean, 1, "A", readonly=True),
 )
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-# What only compiled code calls needs no entry from Python or C: a quarter less to compile.
-_INNER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_part = numba.njit(**_INNER)
 
 
 @functools.cache
 def _compiled() -> tuple[Callable[..., None], Callable[..., None]]:
     """``_take_actions`` and ``_command``, compiled."""
     return (
-        _compile(types.void(*_COMMON, _READ, _READ, _READ), _take_actions),
-        _compile(types.void(*_COMMON, *[_READ] * len(ARM_FIELDS), _WRITE), _command),
+        compile_function(types.void(*_COMMON, _READ, _READ, _READ), _take_actions),
+        compile_function(types.void(*_COMMON, *[_READ] * len(ARM_FIELDS), _WRITE), _command),
     )
-
-
-def _compile(signature: Any, function: Callable[..., None]) -> Callable[..., None]:
-    """Compile, or read from numba's cache: beside this file, else the user's, else none."""
-    try:
-        return numba.njit([signature], cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # numba finds no folder that it may write
-        return numba.njit([signature], **_OPTIONS)(function)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -300,19 +289,19 @@ def _command(
             _finger_targets(slot, settings[0], ctrl[i])
 
 
-@_part
+@part
 def _copy(source, target, first, count):
     for i in range(count):
         target[first + i] = source[i]
 
 
-@_part
+@part
 def _clip(x, low, high):
     """NaN stays NaN."""
     return high if x > high else low if x < low else x
 
 
-@_part
+@part
 def _next_goal(slot, arm, action, settings):
     """``osc.set_goal``: the goal from the arm's pose and the clipped action."""
     x = _clip(action[3], -1.0, 1.0) * settings.max_delta_ori
@@ -331,13 +320,13 @@ def _next_goal(slot, arm, action, settings):
             slot.goal_mat[3 * i + j] = total
 
 
-@_part
+@part
 def _single(x):
     """Rounded to float32."""
     return np.float64(np.float32(x))
 
 
-@_part
+@part
 def _robosuite_rotation(x, y, z):
     """``osc._robosuite_rotation``: rotation matrix of a rotation vector, rounded to float32 where robosuite does."""
     angle = math.sqrt(x * x + y * y + z * z)
@@ -358,7 +347,7 @@ def _robosuite_rotation(x, y, z):
     )
 
 
-@_part
+@part
 def _finger_targets(slot, settings, ctrl):
     """``gripper.integrate`` and ``gripper.command``."""
     direction = 1.0 if slot.grip > 0 else -1.0 if slot.grip < 0 else 0.0
@@ -367,7 +356,7 @@ def _finger_targets(slot, settings, ctrl):
         ctrl[NUM_JOINTS + i] = settings.finger_middle[i] + settings.finger_half[i] * slot.fingers[i]
 
 
-@_part
+@part
 def _torques(slot, home, settings, work, ctrl):
     """``osc.torques`` of the arm in ``work.arm``, into the first seven of ``ctrl``."""
     _fill_table(home, settings, work)
@@ -390,7 +379,7 @@ def _torques(slot, home, settings, work, ctrl):
     _finish(work, settings, ctrl)
 
 
-@_part
+@part
 def _fill_table(home, settings, work):
     """Lay out [M | Jᵀ | M a], M's upper triangle only, and the arm's velocity at the grip site."""
     arm, table, velocity = work.arm, work.table, work.velocity
@@ -409,7 +398,7 @@ def _fill_table(home, settings, work):
         table[i, 13] = total
 
 
-@_part
+@part
 def _fill_jacobian_column(arm, table, j):
     """Column j of the Jacobian: ``axis x (eef - anchor)``, then the axis."""
     x, y, z = arm[_XAXIS + 3 * j], arm[_XAXIS + 3 * j + 1], arm[_XAXIS + 3 * j + 2]
@@ -420,7 +409,7 @@ def _fill_jacobian_column(arm, table, j):
     table[j, 10], table[j, 11], table[j, 12] = x, y, z
 
 
-@_part
+@part
 def _eliminate(work):
     """Eliminate M's lower triangle (it is positive definite: no pivoting) and scale: [Lᵀ | X | Lᵀ a]."""
     table = work.table
@@ -435,7 +424,7 @@ def _eliminate(work):
             table[k, j] *= scale
 
 
-@_part
+@part
 def _fill_systems(slot, settings, work):
     """The columns of X and Lᵀ a with their right-hand sides, and the lengths under which a remainder is rounding."""
     columns, turning = work.columns, work.turning
@@ -454,7 +443,7 @@ def _fill_systems(slot, settings, work):
         columns[c, _SIDE] = 0.0
 
 
-@_part
+@part
 def _turn_between(arm, goal_mat):
     """Sum of the cross products of the axes of hand and goal: twice the rotation between them, while it is small."""
     x = y = z = 0.0
@@ -467,7 +456,7 @@ def _turn_between(arm, goal_mat):
     return x, y, z
 
 
-@_part
+@part
 def _orthogonalise(columns, floor, count, total):
     """Modified Gram-Schmidt over the first ``count`` of ``total`` columns, right-hand sides included."""
     for k in range(count):
@@ -480,7 +469,7 @@ def _orthogonalise(columns, floor, count, total):
                 columns[c, i] -= pivot[i] * ratio
 
 
-@_part
+@part
 def _solve(basis, parts):
     """``osc._solutions``: components of the shortest solution along three directions."""
     parts[2] = basis[2, _SIDE] * basis[2, _INVERSE]
@@ -489,7 +478,7 @@ def _solve(basis, parts):
     parts[0] = (left - _dot(basis[0], basis[2]) * parts[2]) * basis[0, _INVERSE]
 
 
-@_part
+@part
 def _dot(a, b):
     total = a[0] * b[0]
     for i in range(1, NUM_JOINTS):
@@ -497,13 +486,13 @@ def _dot(a, b):
     return total
 
 
-@_part
+@part
 def _add(vector, direction, factor):
     for i in range(NUM_JOINTS):
         vector[i] += direction[i] * factor
 
 
-@_part
+@part
 def _finish(work, settings, ctrl):
     """Torques ``L whitened + bias``, clipped."""
     whitened = work.columns[6]

@@ -1,6 +1,9 @@
-"""How this package compiles functions with numba for simulators' inner loops.
+"""Compiling functions with numba: one cache policy and one set of options for all compiled code.
 
-Everything is float64 without fast-math, so bits depend neither on the batch nor on the machine's vectors.
+Everything is float64 without fast-math, so bits depend neither on the batch nor on the machine's vectors. A function is
+compiled once a machine and read from numba's cache afterwards: beside the function's file, else in the user's cache
+folder, else not at all. Numba looks for changes in the file of the compiled function alone, so keep the functions it
+calls (``part``) in the same file.
 """
 
 from __future__ import annotations
@@ -15,34 +18,36 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-# What only compiled code calls needs no entry from Python or C; called from Python nevertheless, it crashes.
+# What only compiled code calls needs no entry from Python or C, which is a quarter less to compile. Called from Python
+# nevertheless, it crashes.
 _INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 part = numba.njit(**_INNER)
 carray: Any = numba.carray  # pyright: ignore[reportPrivateImportUsage]
 
 
-def builtin(function: Callable[..., Any]) -> Any:
-    """An operation of compiled code that is written in LLVM's terms; literal arguments are known as such."""
+def intrinsic_with_literals(function: Callable[..., Any]) -> Any:
+    """A numba intrinsic that receives literal arguments as literal types, so that it can read their values."""
     return intrinsic(prefer_literal=True)(function)
 
 
 def compile_function(signature: Any, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile for calls from Python, or read from numba's cache: beside the file, else the user's, else none."""
-    try:
-        return numba.njit([signature], cache=True, **OPTIONS)(function)
-    except RuntimeError:  # numba finds no folder that it may write
-        return numba.njit([signature], **OPTIONS)(function)
+    """Compile to a function that Python calls and that releases the interpreter's lock, or read it from the cache."""
+    return _cached(numba.njit, [signature], function)
 
 
 def compile_for_c(signature: Any, function: Callable[..., Any]) -> Any:
-    """Compile to a C function, or read it from numba's cache: beside the file, else the user's, else none."""
+    """Compile to a C function with an ``address``, or read it from the cache."""
+    return _cached(numba.cfunc, signature, function)
+
+
+def _cached(compiler: Callable[..., Any], signature: Any, function: Callable[..., Any]) -> Any:
     try:
-        return numba.cfunc(signature, cache=True, **OPTIONS)(function)
+        return compiler(signature, cache=True, **OPTIONS)(function)
     except RuntimeError:  # numba finds no folder that it may write
-        return numba.cfunc(signature, **OPTIONS)(function)
+        return compiler(signature, **OPTIONS)(function)
 
 
-@builtin
+@intrinsic_with_literals
 def stack_array(typingctx: Any, size: Any) -> Any:
     """Pointer to ``size`` (a literal) floats on the stack of the calling function: no memory is allocated."""
     if not isinstance(size, types.IntegerLiteral):
@@ -57,34 +62,34 @@ def stack_array(typingctx: Any, size: Any) -> Any:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Memory of C libraries, by address.
+# Reading the memory of C libraries by address.
 
 
-@builtin
+@intrinsic_with_literals
 def int32_at(typingctx: Any, address: Any) -> Any:
     """The int32 at an address."""
     return types.int32(types.uintp), _loader(ir.IntType(32))
 
 
-@builtin
+@intrinsic_with_literals
 def address_at(typingctx: Any, address: Any) -> Any:
     """The pointer at an address, as a number."""
     return types.uintp(types.uintp), _loader(ir.IntType(64))
 
 
-@builtin
+@intrinsic_with_literals
 def floats_at(typingctx: Any, address: Any) -> Any:
     """An address as a pointer to float64."""
     return types.CPointer(types.float64)(types.uintp), _pointer(ir.DoubleType())
 
 
-@builtin
+@intrinsic_with_literals
 def singles_at(typingctx: Any, address: Any) -> Any:
     """An address as a pointer to float32."""
     return types.CPointer(types.float32)(types.uintp), _pointer(ir.FloatType())
 
 
-@builtin
+@intrinsic_with_literals
 def int32s_at(typingctx: Any, address: Any) -> Any:
     """An address as a pointer to int32."""
     return types.CPointer(types.int32)(types.uintp), _pointer(ir.IntType(32))

@@ -1,6 +1,6 @@
 """A batch over several devices of one host: each device runs the whole compiled function on its own rows.
 
-In: arrays sharded by their first axis, or replicated. Out: arrays sharded likewise. Nothing is exchanged, so a loop
+In: arrays sharded by their first axis, or replicated. Out: arrays sharded likewise. Devices exchange nothing, so a loop
 ends on a device when its own rows have stopped. Every device has its own executable and its own thread: XLA's
 partitioner does not survive Warp's calls (segmentation fault in the compiler; jax 0.11.2, warp-lang 1.18.0), and a
 thread that waits for a loop's condition on one device must not keep the other devices waiting.
@@ -17,12 +17,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """The same on every device."""
+    """The sharding of arrays that are the same on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def over_rows(mesh: Mesh) -> NamedSharding:
-    """A share of the first axis on every device; as many rows on each."""
+    """The sharding of arrays whose first axis is split evenly over the devices."""
     return NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
 
 
@@ -30,7 +30,8 @@ class Spread:
     """A function of rows, run on every device of a mesh.
 
     Args:
-        function: compiled, and runs where its arguments lie. Every output has a first axis, a share of the whole.
+        function: a compiled function, which runs on the device of its arguments. Rows are
+            the first axis of every output.
         mesh: the devices, one axis.
         shared: how many of the first arguments are the same for all rows.
     """
@@ -41,7 +42,7 @@ class Spread:
         self._threads = ThreadPoolExecutor(mesh.size, thread_name_prefix="vecenv-device")
 
     def __call__(self, *args: Any) -> Any:
-        """Call it; arguments that lie elsewhere are brought to their devices first."""
+        """Call the function; arguments on other devices are copied to the right ones first."""
         put = [jax.device_put(arg, self._replicated) for arg in args[: self._shared]]
         put += [jax.device_put(arg, self._rows) for arg in args[self._shared :]]
         shares = [_share(put, index) for index in range(self._count)]
@@ -58,5 +59,5 @@ class Spread:
 
 
 def _share(tree: Any, index: int) -> Any:
-    """What one device holds of arrays that are spread over all."""
+    """The part of sharded arrays that one device holds."""
     return jax.tree.map(lambda array: array.addressable_shards[index].data, tree)

@@ -1,4 +1,4 @@
-"""Functions of one world that know how many worlds they are mapped over.
+"""Functions of one world that know how many worlds ``vmap`` maps them over.
 
 In: a function of one world, and what it needs for a batch of a given size: MuJoCo Warp's contact memory, a render
 context. Out: a function of one world for any nesting of ``vmap``, which prepares for the whole batch once.
@@ -18,7 +18,7 @@ class Sized:
 
     Args:
         function: ``function(prepared, *args)`` of one world, mapped over its arguments but not over ``prepared``.
-        prepare: ``prepare(num_worlds)`` makes, inside a trace, what that many worlds share.
+        prepare: ``prepare(num_worlds)`` makes what that many worlds share; called while tracing.
     """
 
     def __init__(self, function: Callable[..., Any], prepare: Callable[[int], Any]) -> None:
@@ -77,7 +77,7 @@ def _all_batched(out: Any) -> tuple[Any, Any]:
 
 
 def _fold(x: Any, inner: bool, outer: bool, outer_size: int, inner_size: int) -> Any:
-    """An array with an axis of ``outer_size`` or ``inner_size`` or both in front, with one of their product instead."""
+    """Merge leading axes of ``outer_size`` and ``inner_size`` into one; an axis that is missing is broadcast."""
     if not inner and not outer:
         return x
     if not outer:

@@ -35,12 +35,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import platformdirs
-
 from vecenv.errors import ServiceError
+from vecenv.util import caching
 from voxposer.sandbox.guard import HostFault
 
-VARIABLE = "VECENV_CACHE_DIR"
 OFFLINE = "offline/"
 # Layout of requests and replies on disk; raised when it changes.
 FORMAT = 1
@@ -422,17 +420,8 @@ def _register_offline() -> None:
 # The cache
 
 
-def folder() -> Path | None:
-    """Where replies are kept; None when the cache is off."""
-    chosen = os.environ.get(VARIABLE)
-    if chosen is not None:
-        return Path(chosen).expanduser() / "llm" if chosen else None
-    default = platformdirs.user_cache_path("vecenv") / "llm"
-    return default if default.is_absolute() else None  # "~" stays in it for a user without a home
-
-
 def _cache(wanted: bool | Path) -> ReplyCache | None:
-    where = wanted if isinstance(wanted, Path) else folder() if wanted else None
+    where = wanted if isinstance(wanted, Path) else caching.folder("llm") if wanted else None
     return None if where is None else ReplyCache(where)
 
 

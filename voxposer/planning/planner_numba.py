@@ -20,14 +20,11 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
+from vecenv.util.compiled import compile_function, part
 from vecenv.util.cores import usable_cores
 from voxposer.planning import maps
 from voxposer.planning.planner import Fault, PlannerConfig, neighbour_offsets
 
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-# What only compiled code calls needs no entry from Python or C; called from Python nevertheless, it crashes.
-_INNER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_part = numba.njit(**_INNER)
 # Rows of the volume blurred together: longer inner loops, and still in a core's cache.
 _STRIP = 4
 
@@ -104,7 +101,7 @@ def _over_cores(work: Callable[[int], None], slots: int) -> None:
 # Kernels, compiled when first called. numba widens small integers, so distances are float32, exact up to 2^24.
 
 
-@_part
+@part
 def _finite(volume: Any) -> bool:
     broken = 0
     for value in volume.ravel():
@@ -113,7 +110,7 @@ def _finite(volume: Any) -> bool:
     return broken == 0
 
 
-@_part
+@part
 def _blur(volume: Any, half: Any, fold: Any, out: Any) -> None:
     """``gaussian_blur`` of [N, N, N]: axis 0, then 1, then 2; ``fold`` [N + 2 radius] says where samples are."""
     n = volume.shape[0]
@@ -151,7 +148,7 @@ def _blur(volume: Any, half: Any, fold: Any, out: Any) -> None:
                     out[x, y, z] = 0.0
 
 
-@_part
+@part
 def _blur_rows(
     source: Any,
     first: int,
@@ -197,7 +194,7 @@ def _blur_rows(
                 row[c] += (p0[c] + p1[c]) * u
 
 
-@_part
+@part
 def _find_live(source: Any, first: int, columns: int, live: Any) -> bool:
     """Write which rows of some columns of ``source`` [n, m] are not all zero; whether any is not."""
     some = False
@@ -210,7 +207,7 @@ def _find_live(source: Any, first: int, columns: int, live: Any) -> bool:
     return some
 
 
-@_part
+@part
 def _occupied_heights(volume: Any) -> Any:
     """First index along the last axis with something other than zero, and one more than the last such index."""
     n = volume.shape[0]
@@ -227,7 +224,7 @@ def _occupied_heights(volume: Any) -> Any:
     return low, high
 
 
-@_part
+@part
 def _squares(target: Any, out: Any) -> bool:
     """``squared_distance`` to the voxels of [N, N, N] that equal 1; False if there are none."""
     n = target.shape[0]
@@ -249,7 +246,7 @@ def _squares(target: Any, out: Any) -> bool:
     return bool(planes.any())
 
 
-@_part
+@part
 def _line_squares(target: Any, out: Any) -> bool:
     """Squared distances along a line [n]; False, and nothing written, without a target on it."""
     last, n = -1, len(out)
@@ -263,7 +260,7 @@ def _line_squares(target: Any, out: Any) -> bool:
     return last != -1
 
 
-@_part
+@part
 def _spread(rows: Any, first: int, columns: int, live: Any, out: Any) -> None:
     """``out[i] = min over live j of rows[j] + (i - j)²`` for some columns of ``rows`` [n, m]; ``out`` [n, columns]."""
     for i in range(out.shape[0]):
@@ -348,7 +345,7 @@ def _walk(cost: Any, raw: Any, planar: bool, offsets: Any, threshold: float) -> 
     return length
 
 
-@_part
+@part
 def _cheapest(cost: Any, here: Any, planar: bool, offsets: Any) -> Any:
     """First of the cheapest neighbours, as a row of ``offsets``, and its cost."""
     size, choice, least = cost.shape[0], -1, np.inf
@@ -393,15 +390,7 @@ def _kernels() -> _Kernels:
     volume, f8, i8 = numba.float64[:, :, ::1], numba.float64, numba.int64
     raw, offsets, voxel = numba.int32[:, ::1], numba.int64[:, ::1], numba.int64[::1]
     return _Kernels(
-        _compile(_cost, i8(volume, volume, numba.float64[::1], numba.int64[::1], f8, f8, volume)),
-        _compile(_walk, i8(volume, raw, numba.boolean, offsets, f8)),
-        _compile(_nearest, numba.void(volume, voxel, numba.int32[::1])),
+        compile_function(i8(volume, volume, numba.float64[::1], numba.int64[::1], f8, f8, volume), _cost),
+        compile_function(i8(volume, raw, numba.boolean, offsets, f8), _walk),
+        compile_function(numba.void(volume, voxel, numba.int32[::1]), _nearest),
     )
-
-
-def _compile(function: Callable[..., Any], signature: Any) -> Callable[..., Any]:
-    """With numba's cache beside this file, else the user's, else none."""
-    try:
-        return numba.njit([signature], cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # numba finds no folder that it may write
-        return numba.njit([signature], **_OPTIONS)(function)

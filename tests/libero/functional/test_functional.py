@@ -24,7 +24,7 @@ from vecenv.libero.functional import (
     randomize,
 )
 from vecenv.libero.physics.budgets import Budget
-from vecenv.libero.physics.mjx import backend as mjx
+from vecenv.libero.physics.mjx.options import compiler_options
 from vecenv.libero.tasks.suites import UnknownTask
 
 WORLDS = 2
@@ -36,7 +36,7 @@ ROOMY = {
     "jax": Budget(contacts=80, rows=1, pairs=30, candidates=1),
 }
 # LLVM's optimisation off: programs compile several times faster.
-OPTIONS: dict[str, Any] = {**mjx.compiler_options(), "xla_backend_optimization_level": 0}
+OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level": 0}
 compiled: Callable[..., Callable[..., Any]] = partial(jax.jit, compiler_options=OPTIONS)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from support.paths import DATA
 
-from vecenv.libero.physics.colliders.boxbox import MOST, box_box
+from vecenv.libero.physics.colliders.boxbox import box_box
+from vecenv.libero.physics.colliders.boxbox_numba import MOST
 
 RECORDED = DATA / "box_contacts_mujoco_3_3_0.npz"
 

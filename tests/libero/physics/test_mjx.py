@@ -19,7 +19,8 @@ from vecenv.contract import BatchEnv
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.physics.budgets import Budget, BudgetError
 from vecenv.libero.physics.mjx import backend as mjx_physics
-from vecenv.libero.physics.mjx.backend import MjxError, fault_text, resolve_impl
+from vecenv.libero.physics.mjx.options import MjxError, resolve_impl
+from vecenv.libero.physics.mjx.step import fault_text
 
 pytest.importorskip("warp", reason="MuJoCo Warp is an extra: pip install 'vecenv[warp]'")
 

@@ -21,10 +21,12 @@ from support.paths import DATA
 import vecenv
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv
 from vecenv.libero.physics.colliders import boxbox_jax, planemesh_jax
-from vecenv.libero.physics.colliders.boxbox import MOST, box_box
+from vecenv.libero.physics.colliders.boxbox import box_box
+from vecenv.libero.physics.colliders.boxbox_numba import MOST
 from vecenv.libero.physics.mjx import contacts as mjx_contacts
-from vecenv.libero.physics.mjx.backend import jit
+from vecenv.libero.physics.mjx import private
 from vecenv.libero.physics.mjx.contacts import MjxContactsError
+from vecenv.libero.physics.mjx.options import jit
 from vecenv.libero.scene import contacts
 
 wp = pytest.importorskip("warp", reason="MuJoCo Warp is an extra: pip install 'vecenv[warp]'")
@@ -319,22 +321,21 @@ def test_derivatives_of_a_mesh_on_a_plane_are_those_of_its_points() -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Another MJX.
+# Another version of MJX.
 
 
 def test_an_mjx_whose_functions_have_changed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, collision_primitive
-
+    collision_driver, collision_primitive = private.warp_collision_driver, private.warp_collision_primitive
     changes: list[tuple[Any, str, Any, str]] = [
         (collision_driver, "primitive_narrowphase", lambda model, data: None, "takes model, data"),
         (collision_driver, "_narrowphase", lambda m, d, ctx: None, "does not refer to"),
         (collision_primitive, "box_box", lambda a, b: None, "takes a, b"),
-        (collision_primitive, "_PRIMITIVE_COLLISIONS", {}, "no function"),
-        (mjx_contacts.jax_driver, "make_condim", lambda m, impl: None, "does not refer to _COLLISION_FUNC"),
-        (mjx_contacts.jax_driver, "_COLLISION_FUNC", {}, "no function"),
+        (collision_primitive, "_PRIMITIVE_COLLISIONS", {}, "is not a function"),
+        (private.jax_collision_driver, "make_condim", lambda m, impl: None, "does not refer to _COLLISION_FUNC"),
+        (private.jax_collision_driver, "_COLLISION_FUNC", {}, "is not a function"),
     ]
     for owner, name, value, message in changes:
-        jax_side = owner is mjx_contacts.jax_driver
+        jax_side = owner is private.jax_collision_driver
         find = mjx_contacts._jax_functions if jax_side else mjx_contacts._warp_narrowphase
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, value)
@@ -342,8 +343,18 @@ def test_an_mjx_whose_functions_have_changed_is_refused(monkeypatch: pytest.Monk
                 find()
 
 
+def test_a_private_name_that_is_missing_is_reported_with_both_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(private, "mat43")
+    with pytest.raises(ImportError, match=rf"has no mat43 .*tested with mujoco-mjx {private.TESTED}"):
+        _ = private.mat43
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        getattr(private, "nonsense")  # noqa: B009
+
+
 def test_the_installed_mjx_is_the_one_that_is_understood() -> None:
-    """When this fails, MJX has moved what ``mjx_contacts`` wraps: read its changes, then ``mjx_contacts``."""
+    """When this fails, MJX has changed what ``private`` imports or ``mjx_contacts`` copies: read its changes first."""
+    for name in private.__all__:
+        assert getattr(private, name) is not None, name
     assert callable(mjx_contacts._warp_narrowphase())
     assert set(mjx_contacts._jax_functions()) == {"collision", "make_condim"}
 

@@ -14,7 +14,8 @@ import pytest
 from mujoco import mjx
 
 from vecenv.libero.physics import newton
-from vecenv.libero.physics.mjx.backend import compiler_options, substep
+from vecenv.libero.physics.mjx.options import compiler_options
+from vecenv.libero.physics.mjx.step import substep
 
 OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level": 0}
 compiled: Callable[..., Callable[..., Any]] = partial(jax.jit, compiler_options=OPTIONS)

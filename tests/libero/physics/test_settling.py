@@ -11,16 +11,16 @@ import vecenv
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.physics import settling
 from vecenv.libero.physics.base import SETTLE_ACTION
-from vecenv.libero.scene import cache
 from vecenv.libero.scene.scene import compile_scene
 from vecenv.libero.tasks import fixtures, settled, suites
+from vecenv.util import caching
 
 SUITE, TASK = "libero_goal", 0
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path))
     return tmp_path / "settled"
 
 
@@ -81,7 +81,7 @@ def test_a_damaged_file_is_settled_again(folder: Path) -> None:
 
 
 def test_without_a_cache_folder_starts_settle_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(cache.VARIABLE, "")
+    monkeypatch.setenv(caching.VARIABLE, "")
     env = make(fixtures="sampled")
     assert np.isfinite(env.state().qpos).all()
     env.close()

@@ -20,7 +20,7 @@ import vecenv
 from vecenv.contract import Egocentric
 from vecenv.libero.functional import FunctionalConfig, FunctionalLibero
 from vecenv.libero.physics.budgets import Budget
-from vecenv.libero.physics.mjx import backend as mjx
+from vecenv.libero.physics.mjx.options import compiler_options
 from vecenv.libero.render import gl
 from vecenv.libero.render import ray_kernel as raykernel
 from vecenv.libero.render.options import (
@@ -42,7 +42,7 @@ LEAST_PSNR, LEAST_IOU = 24.0, 0.97
 # At the edge of a thing of fewer pixels, one pixel is much.
 LEAST_PIXELS = 500
 # LLVM's optimisation off: programs compile several times faster.
-OPTIONS: dict[str, Any] = {**mjx.compiler_options(), "xla_backend_optimization_level": 0}
+OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level": 0}
 
 
 @cache

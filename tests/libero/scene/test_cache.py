@@ -17,6 +17,7 @@ from vecenv.libero.scene.arenas import ARENAS
 from vecenv.libero.scene.cache import SceneFileError, cached_scene, content_key, read_scene, write_scene
 from vecenv.libero.scene.scene import Scene, SceneError, SceneSource, compile_scene, scene_source
 from vecenv.libero.tasks import suites
+from vecenv.util import caching
 
 PROBLEM = suites.task("libero_goal", 0).problem()
 PAIRS = goals.contact_pairs(task.problem() for task in suites.list_tasks("libero_goal"))
@@ -29,7 +30,7 @@ TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache; the folder its scenes go to."""
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache" / "scenes"
 
 
@@ -180,27 +181,27 @@ def test_a_folder_that_cannot_be_written_is_no_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: Scene
 ) -> None:
     (tmp_path / "file").write_text("not a folder")
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file" / "cache"))
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path / "file" / "cache"))
     assert_same(cached_scene(PROBLEM, contact_pairs=PAIRS), scene)
 
 
 def test_the_cache_can_be_turned_off(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scene: Scene) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv(cache.VARIABLE, "")
-    assert cache.folder() is None
+    monkeypatch.setenv(caching.VARIABLE, "")
+    assert caching.folder("scenes") is None
     assert_same(cached_scene(PROBLEM, contact_pairs=PAIRS), scene)
     assert not names_in(tmp_path)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="XDG_CACHE_HOME is Linux's name for the user's cache folder")
 def test_scenes_go_to_the_users_cache_folder_by_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv(cache.VARIABLE, raising=False)
+    monkeypatch.delenv(caching.VARIABLE, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache.folder() == tmp_path / "vecenv" / "scenes"
+    assert caching.folder("scenes") == tmp_path / "vecenv" / "scenes"
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache.write_file(tmp_path / "scene", b"old")
+    caching.write_file(tmp_path / "scene", b"old")
 
     def full(path: Path, data: bytes) -> int:
         with path.open("wb") as file:
@@ -209,7 +210,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, mon
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="no space left"):
-        cache.write_file(tmp_path / "scene", b"new")
+        caching.write_file(tmp_path / "scene", b"new")
     assert (tmp_path / "scene").read_bytes() == b"old"
     assert names_in(tmp_path) == {"scene"}
 
@@ -227,9 +228,10 @@ def test_processes_that_compile_the_same_scene_do_not_disturb_each_other(folder:
     code = (
         "from vecenv.libero.scene import cache\n"
         "from vecenv.libero.tasks import suites\n"
+        "from vecenv.util import caching\n"
         "for _ in range(5):\n"
         "    cache.cached_scene(suites.task('libero_goal', 0).problem())\n"
-        "    [path.unlink(missing_ok=True) for path in cache.folder().glob('*.json')]\n"
+        "    [path.unlink(missing_ok=True) for path in caching.folder('scenes').glob('*.json')]\n"
         "cache.cached_scene(suites.task('libero_goal', 0).problem())\n"
     )
     workers = [subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True) for _ in range(3)]

@@ -10,7 +10,7 @@ from vecenv.libero.functional.config import (
 from vecenv.libero.functional.env import FunctionalLibero
 from vecenv.libero.functional.randomize import Randomization, randomize
 from vecenv.libero.functional.state import Data, FunctionalState
-from vecenv.libero.physics.mjx.backend import jit
+from vecenv.libero.physics.mjx.options import jit
 
 __all__ = [
     "ACTIONS",

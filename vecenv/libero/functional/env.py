@@ -42,7 +42,7 @@ from vecenv.libero.functional.physics import WorldPhysics
 from vecenv.libero.functional.starts import Starts
 from vecenv.libero.functional.state import FunctionalState
 from vecenv.libero.physics.base import SUBSTEPS
-from vecenv.libero.physics.mjx import backend as mjx_physics
+from vecenv.libero.physics.mjx import model as mjx_model
 from vecenv.libero.render.raytrace import RayTracer
 from vecenv.libero.render.scenery import Scenery, installed_scenery
 from vecenv.libero.scene import goals
@@ -87,8 +87,8 @@ class FunctionalLibero:
         sharing = episode_starts.sharing(sources, problem.scene_key())
         self.scene = _with_cone(_scene(source, sharing, self.config), CONES[self.config.cone])
         budget = self.config.budget or episode_starts.measured_budget(self.scene, sharing)
-        iterations = self.config.iterations or mjx_physics.usual_iterations(self.config.impl, self.config.geometry)
-        built = mjx_physics.build(self.scene, impl=self.config.impl, budget=budget, iterations=iterations)
+        iterations = self.config.iterations or mjx_model.usual_iterations(self.config.impl, self.config.geometry)
+        built = mjx_model.build(self.scene, impl=self.config.impl, budget=budget, iterations=iterations)
         self.impl, self.budget = built.impl, budget
         self._physics = WorldPhysics(built, self.config.action)
         # Playground's wrapper for domain randomisation puts another model here while it traces.

@@ -25,8 +25,10 @@ from vecenv.controllers import kinematics
 from vecenv.libero.functional.starts import Begin
 from vecenv.libero.functional.state import PHYSICS_FIELDS, Data
 from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS
-from vecenv.libero.physics.mjx import backend as mjx_physics
-from vecenv.libero.physics.mjx.backend import System, World
+from vecenv.libero.physics.mjx import model as mjx_model
+from vecenv.libero.physics.mjx import step as mjx_step
+from vecenv.libero.physics.mjx.model import System
+from vecenv.libero.physics.mjx.step import World
 from vecenv.libero.robot import ARM_DOFS, ROBOT_DOFS
 from vecenv.libero.tasks import settled as settled_starts
 from vecenv.util.arrays import AnyArray
@@ -67,10 +69,10 @@ class WorldPhysics:
         action: a key of ``config.ACTIONS``.
     """
 
-    def __init__(self, built: mjx_physics.Build, action: str) -> None:
+    def __init__(self, built: mjx_model.Build, action: str) -> None:
         self._built = built
         limits = built.scene.model.jnt_range[:ARM_DOFS].T.astype(np.float32)
-        self._act = mjx_physics.control_step if action == "osc" else functools.partial(joint_step, limits=limits)
+        self._act = mjx_step.control_step if action == "osc" else functools.partial(joint_step, limits=limits)
         self._blanks: dict[int, Callable[[], mjx.Data]] = {}
         # Only warp's contact memory is shared by a batch, and only jax can be differentiated.
         sized = built.impl == "warp"
@@ -94,9 +96,9 @@ class WorldPhysics:
 
     def _begin(self, blank: mjx.Data, model: mjx.Model, start: Begin) -> Data:
         system = self._system(model)
-        world = mjx_physics.new_world(system, blank)._replace(body_pos=start.body_pos, body_quat=start.body_quat)
+        world = mjx_step.new_world(system, blank)._replace(body_pos=start.body_pos, body_quat=start.body_quat)
         time = jnp.asarray(settled_starts.TIME, start.qpos.dtype)
-        return _kept(mjx_physics.start_world(system, world, start.qpos, start.qvel, time, jnp.asarray(True)))
+        return _kept(mjx_step.start_world(system, world, start.qpos, start.qvel, time, jnp.asarray(True)))
 
     def _advance(self, blank: mjx.Data, model: mjx.Model, data: Data, action: Float[Array, " n"]) -> Data:
         full = blank.replace(**{name: getattr(data, name) for name in PHYSICS_FIELDS})
@@ -134,12 +136,12 @@ def _joint_step(system: System, world: World, action: Float[Array, "8"], limits:
         seen = (*kinematics.hand_pose(system.chain, robot), robot[ARM_DOFS:])
         fingers = gripper_control.integrate(fingers, action[ARM_DOFS])
         ctrl = jnp.concatenate([joint_control.torques(arm, goal), gripper_control.command(fingers)])
-        data = mjx_physics.substep(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
-        return (data, fingers, fault | mjx_physics._overflow(data)), seen
+        data = mjx_step.substep(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
+        return (data, fingers, fault | mjx_step.overflow_bits(data)), seen
 
     carry = (world.data, world.gripper, jnp.zeros((), jnp.int32))
     (data, fingers, fault), (pos, quat, finger_pos) = lax.scan(advance, carry, None, SUBSTEPS)
-    fault = fault | jnp.where(mjx_physics._stable(data), 0, mjx_physics._UNSTABLE)
+    fault = fault | jnp.where(mjx_step.is_stable(data), 0, mjx_step.UNSTABLE)
     return world._replace(
         data=data,
         gripper=fingers,

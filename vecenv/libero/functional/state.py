@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vecenv.libero.functional.objectives import View
-from vecenv.libero.physics.mjx.backend import World
+from vecenv.libero.physics.mjx.step import World
 
 
 @jax.tree_util.register_dataclass
@@ -31,7 +31,7 @@ class Data:
         xpos: body positions, world frame, metres, [nbody, 3]. xquat: body orientations, wxyz, [nbody, 4].
         geom_xpos: [ngeom, 3]. geom_xmat: [ngeom, 3, 3]; warp computes those of fixtures only when an episode begins.
         site_xpos: [nsite, 3]. site_xmat: [nsite, 3, 3]. sensordata: contact sensors, [nsensordata].
-        world: fixture poses, controller memory, proprioception and faults (``vecenv.libero.physics.mjx.backend.World``,
+        world: fixture poses, controller memory, proprioception and faults (``vecenv.libero.physics.mjx.step.World``,
         no ``data``).
         start_height: height of the target's origin when the episode began, metres.
     """

@@ -1,8 +1,8 @@
-"""What every physics backend offers the environment, and the loops that are the same on all of them.
+"""What every physics backend offers the environment, and the loops that all of them share.
 
 In: scenes, which scene each slot runs, start states, goals, and actions or plans. Out: the state of every slot, its
-verdict, and why it failed if it did. ``NativePhysics`` steps MuJoCo on CPU threads; ``MjxPhysics`` runs MJX under
-``jax.jit`` and replaces the loops here by compiled ones.
+verdict, and the cause of its fault if it has one. ``NativePhysics`` steps MuJoCo on CPU threads;
+``MjxPhysics`` runs MJX under ``jax.jit`` and replaces the loops here by compiled ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SUBSTEPS = 25
 OBSERVED_POSE = 23
 OBSERVED_FINGERS = 24
 
-# What LIBERO evaluations send while objects settle after a reset (no motion, gripper open), and for how many ticks.
+# The action (no motion, gripper open) and the ticks of LIBERO's evaluations while objects settle after a reset.
 SETTLE_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 SETTLE_TICKS = 10
 
@@ -44,8 +44,8 @@ class Start:
         body_pos: their positions in metres, world frame, [n, F, 3].
         body_quat: their orientations wxyz, [n, F, 4].
         time: simulated seconds the starts have run for.
-        settled: the starts have already been stepped with an idle arm and an opening gripper, so the controller sees
-            them as they are; otherwise it still remembers the pose of the reset.
+        settled: whether the starts have already been stepped with an idle arm and an opening gripper. The controller
+            then sees them as they are; otherwise its first substep uses the pose of the reset.
     """
 
     qpos: np.ndarray
@@ -56,7 +56,7 @@ class Start:
     time: float = 0.0
     settled: bool = False
 
-    def some(self, chosen: np.ndarray) -> Start:
+    def select(self, chosen: np.ndarray) -> Start:
         """The starts of the chosen slots, indices or bool [n]."""
         given = {"qpos": self.qpos, "qvel": self.qvel, "body_pos": self.body_pos, "body_quat": self.body_quat}
         return dataclasses.replace(self, **{name: array[chosen] for name, array in given.items()})
@@ -128,17 +128,17 @@ class Group(Protocol):
         ...
 
     def refresh_kinematics(self) -> None:
-        """Bring the kinematics up to the present state."""
+        """Compute the kinematics of the current state."""
         ...
 
     def refresh_all(self) -> None:
-        """Bring kinematics, contacts and contact sensors up to the present state."""
+        """Compute kinematics, contacts and contact sensors of the current state."""
         ...
 
 
 @dataclass(frozen=True)
-class Ran:
-    """What ``run`` and ``follow`` did.
+class RunResult:
+    """The result of ``run``.
 
     Attributes:
         ticks: control steps each slot took, int [B].
@@ -152,8 +152,8 @@ class Ran:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Followed(Ran):
-    """What ``follow`` did.
+class FollowResult(RunResult):
+    """The result of ``follow``.
 
     Attributes:
         converged: within tolerance when the waypoint was left, bool [B, T].
@@ -169,7 +169,7 @@ class Physics(ABC):
 
     Attributes:
         num_envs: slots, B.
-        faults: why the physics of a slot failed, by slot; empty when all are healthy.
+        faults: cause of each faulty slot, by slot; empty when all are healthy.
     """
 
     num_envs: int
@@ -201,7 +201,7 @@ class Physics(ABC):
 
     @abstractmethod
     def place(self, group: Any, slots: np.ndarray, start: Start) -> None:
-        """Begin an episode in ``slots``, all of ``group``: physics state, fixture poses, controller memory."""
+        """Begin an episode in ``slots``, which belong to ``group``: physics state, fixture poses, controller memory."""
 
     @abstractmethod
     def write_state(self, group: Any, qpos: np.ndarray, qvel: np.ndarray, time: np.ndarray) -> None:
@@ -218,21 +218,21 @@ class Physics(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Release what the batch holds."""
+        """Release threads and memory."""
 
     def serves(self, scenes: Sequence[Scene], scene_of_slot: np.ndarray) -> bool:
-        """Whether this batch already has these scenes in these slots."""
+        """Whether this batch already runs these scenes in these slots."""
         if len(scene_of_slot) != self.num_envs:
             return False
         wanted = [scenes[int(index)] for index in scene_of_slot]
         return all(wanted[slot] is group.scene for group in self.groups for slot in group.slots)
 
     def set_goals(self, tables: Sequence[goals.GoalTable]) -> None:
-        """The goals of the slots, one table a group, rows in the order of its slots."""
+        """Set the goals of the slots: one table a group, rows in the order of its slots."""
         self._goals = list(tables)
 
     def judge(self) -> np.ndarray:
-        """The goals on the kinematics and contacts that the last call left, bool [B]."""
+        """Whether the goals hold for the kinematics and contacts of the last call, bool [B]."""
         verdict = np.zeros(self.num_envs, bool)
         for group, table in zip(self.groups, self._goals, strict=True):
             verdict[group.slots] = goals.evaluate(
@@ -262,21 +262,21 @@ class Physics(ABC):
         watchers: Sequence[Watcher] = (),
         *,
         until_success: bool = True,
-    ) -> Ran:
-        """Execute a chunk of actions; a slot stops at its own success, fault or limit.
+    ) -> RunResult:
+        """Execute a chunk of actions; each slot stops at its own success, fault or limit.
 
         Args:
             chunk: finite actions within [-1, 1], [B, K, 7].
-            active: slots that take part, bool [B].
+            active: slots that move, bool [B].
             limit: control steps each slot may still take, int [B].
             watchers: called with the actions [B, 7] and the active slots, bool [B], before every tick.
-            until_success: False goes on after success.
+            until_success: whether a slot stops at success.
         """
         loop = _HostLoop(self, active, limit, watchers, until_success)
         for k in range(chunk.shape[1]):
             if not loop.tick(chunk[:, k]).any():
                 break
-        return Ran(ticks=loop.ticks, success=loop.success, solved=loop.solved)
+        return RunResult(ticks=loop.ticks, success=loop.success, solved=loop.solved)
 
     def follow(
         self,
@@ -288,15 +288,15 @@ class Physics(ABC):
         max_misses: int | None = None,
         watchers: Sequence[Watcher] = (),
         until_success: bool = True,
-    ) -> Followed:
+    ) -> FollowResult:
         """Follow plans; a slot stops at the end of its plan and at its own success, fault or limit.
 
         Args:
             plan: waypoints, T a slot.
-            active: slots that take part, bool [B].
+            active: slots that move, bool [B].
             limit: control steps each slot may still take, int [B].
             config: tolerances and speeds.
-            max_misses: give a slot up after this many waypoints in a row that ran out of ticks; None never does.
+            max_misses: stop a slot after this many waypoints in a row that ran out of ticks; None for no limit.
             watchers, until_success: as for ``run``.
         """
         follower = _follower(config)
@@ -311,7 +311,7 @@ class Physics(ABC):
             actions, progress = follower.action(plan, progress, self.eef())
             moved = loop.tick(np.asarray(actions), going)
             progress = follower.advance(plan, progress, self.eef(), moved)
-        return Followed(
+        return FollowResult(
             ticks=loop.ticks,
             success=loop.success,
             solved=loop.solved,
@@ -339,7 +339,7 @@ class _HostLoop:
         self.solved = np.zeros(len(active), bool)
 
     def tick(self, actions: np.ndarray, also: np.ndarray | None = None) -> np.ndarray:
-        """One control step of the slots that are still going (and in ``also``); returns which those were."""
+        """One control step of the slots that are still going (and in ``also``); returns which slots moved."""
         moved = self.going if also is None else self.going & also
         if not moved.any():
             return moved

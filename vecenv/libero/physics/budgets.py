@@ -4,7 +4,7 @@ In: a scene and start states of its tasks. Out: a ``Budget``: the most contacts 
 over its start and two rollouts, one of random actions and one that grasps and presses objects, times a margin. MJX
 allocates memory once: contacts of a whole batch (``naconmax``, warp), constraint rows of a world (``njmax``, warp),
 contacts of a world (``max_contact_points``, jax) and candidate pairs (``max_geom_pairs``, jax). What does not fit is
-dropped, so a world that runs out is a fault.
+dropped, so a world that exceeds its budget is a fault.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ import numpy as np
 
 from vecenv.errors import InvalidInput
 from vecenv.libero.physics.base import Group, Start
-from vecenv.libero.scene import cache
 from vecenv.libero.scene.elements import CONTACT_LIMIT, PAIR_LIMIT
 from vecenv.libero.scene.scene import Scene
+from vecenv.util import caching
 
-# Factors on the most that was seen. Two boxes of published contacts have up to eight, and how many changes from substep
-# to substep while fingers press: 1.3 times the rows were too few for libero_10 task 0 (5 of 10 episodes of pick_place).
+# Factors on the measured maxima. Two boxes have up to eight published contacts, and the number changes from substep to
+# substep while fingers press: 1.3 times the rows were too few for libero_10 task 0 (5 of 10 episodes of pick_place).
 MARGINS = {"contacts": 1.5, "rows": 2.0, "pairs": 1.5, "candidates": 1.5, "share": 1.75}
 # Control ticks of the two rollouts.
-FLAILING, GRASPING = 60, 80
-# Part of the cache key: raised when what is measured changes.
+RANDOM_TICKS, GRASPING_TICKS = 60, 80
+# Part of the cache key: increased when the measurement changes.
 VERSION = 7
 _HOLD = 5
 _DOWNWARDS = np.array([0, 0, -0.5, 0, 0, 0, 0])
@@ -58,7 +58,7 @@ class Budget:
         candidates: pairs of geoms whose oriented bounding boxes overlap, in one world; warp keeps them where contacts
             go.
         share: what a world of a large batch adds to the memory that warp's worlds share for contacts and candidates;
-            as much as the fullest world by default. Worlds are never all as full as the fullest.
+            as much as the fullest world by default. Never are all worlds as full as the fullest.
     """
 
     contacts: int
@@ -93,7 +93,7 @@ class Budget:
         return model
 
 
-def measure(scene: Scene, starts: Start, *, ticks: tuple[int, int] = (FLAILING, GRASPING)) -> Budget:
+def measure(scene: Scene, starts: Start, *, ticks: tuple[int, int] = (RANDOM_TICKS, GRASPING_TICKS)) -> Budget:
     """Measure a scene on native MuJoCo.
 
     Every start is stepped twice: with random actions that tend downwards, and with a hand that goes to one object after
@@ -113,7 +113,7 @@ def measure(scene: Scene, starts: Start, *, ticks: tuple[int, int] = (FLAILING, 
     group = physics.groups[0]
     contacts, rows, pos, mat = (group.bind(name) for name in ("ncon", "nefc", "geom_xpos", "geom_xmat"))
     pairs, seen = _Pairs(scene.model), np.ones(len(MARGINS))
-    for count, actions in zip(ticks, (_flailing(worlds), _grasping(scene, group)), strict=True):
+    for count, actions in zip(ticks, (_random_actions(worlds), _grasping_actions(scene, group)), strict=True):
         physics.place(group, np.arange(worlds), starts)
         for _ in range(count):
             physics.control_step(np.clip(next(actions), -1, 1), np.ones(worlds, bool))
@@ -124,7 +124,7 @@ def measure(scene: Scene, starts: Start, *, ticks: tuple[int, int] = (FLAILING, 
     return Budget(**{name: math.ceil(most * MARGINS[name]) for name, most in zip(MARGINS, seen, strict=True)})
 
 
-def _flailing(worlds: int) -> Iterator[np.ndarray]:
+def _random_actions(worlds: int) -> Iterator[np.ndarray]:
     """Random actions that tend downwards, [worlds, 7]."""
     rng = np.random.default_rng(0)
     while True:
@@ -132,7 +132,7 @@ def _flailing(worlds: int) -> Iterator[np.ndarray]:
         yield from itertools.repeat(actions, _HOLD)
 
 
-def _grasping(scene: Scene, group: Group) -> Iterator[np.ndarray]:
+def _grasping_actions(scene: Scene, group: Group) -> Iterator[np.ndarray]:
     """Actions of hands that grasp, drag and press one object after the other, [worlds, 7]."""
     rng, worlds = np.random.default_rng(0), len(group.slots)
     bodies = np.array([scene.model.body(entity.root_body).id for entity in scene.objects or scene.fixtures])
@@ -149,24 +149,24 @@ def _grasping(scene: Scene, group: Group) -> Iterator[np.ndarray]:
 
 
 def cached(scene: Scene, starts: Start) -> Budget:
-    """``measure``, remembered in the user's cache folder; the key is the model, the starts and how it is measured."""
-    folder = cache.folder()
+    """``measure``, with the result kept in the user's cache folder; the key covers model, starts and measurement."""
+    folder = caching.folder("budgets")
     if folder is None:
         return measure(scene, starts)
-    path = folder.with_name("budgets") / f"{_key(scene.model, starts)}.json"
+    path = folder / f"{_key(scene.model, starts)}.json"
     with contextlib.suppress(OSError, ValueError, TypeError):
         return Budget(**json.loads(path.read_bytes()))
     budget = measure(scene, starts)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        cache.write_file(path, json.dumps(asdict(budget)).encode())
+        caching.write_file(path, json.dumps(asdict(budget)).encode())
     return budget
 
 
 def _key(model: mujoco.MjModel, starts: Start) -> str:
     buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
-    digest = hashlib.sha256(repr((VERSION, FLAILING, GRASPING, MARGINS, mujoco.__version__)).encode())
+    digest = hashlib.sha256(repr((VERSION, RANDOM_TICKS, GRASPING_TICKS, MARGINS, mujoco.__version__)).encode())
     for array in (buffer, starts.qpos, starts.qvel, starts.body_pos, starts.body_quat):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

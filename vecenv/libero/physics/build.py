@@ -42,7 +42,8 @@ def make_physics(
         from vecenv.libero.physics.native import NativePhysics
 
         return NativePhysics(scenes, scene_of_slot, num_threads)
-    from vecenv.libero.physics.mjx.backend import MjxPhysics, build, usual_iterations
+    from vecenv.libero.physics.mjx.backend import MjxPhysics
+    from vecenv.libero.physics.mjx.model import build, usual_iterations
 
     if backend not in BACKENDS:
         raise ValueError(f"backend={backend!r}: expected one of {', '.join(BACKENDS)}")

@@ -19,7 +19,6 @@ when follows robosuite 1.4.0:
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Collection, Sequence
@@ -41,8 +40,8 @@ from vecenv.util.cores import usable_cores
 BLOCK = 8
 
 _POSITION_AND_VELOCITY = mujoco.mjtStage.mjSTAGE_VEL.value
-_NOTHING = mujoco.mjtStage.mjSTAGE_NONE.value
-_EVERYTHING = mujoco.mjtStage.mjSTAGE_ACC.value
+_NO_STAGE = mujoco.mjtStage.mjSTAGE_NONE.value
+_ALL_STAGES = mujoco.mjtStage.mjSTAGE_ACC.value
 
 _FAULTS = {
     mujoco.mjtWarning.mjWARN_CONTACTFULL: "contact memory exhausted",
@@ -62,7 +61,7 @@ _Item = TypeVar("_Item")
 
 
 class Workers:
-    """Threads that share out the blocks of a batch.
+    """Threads that step the blocks of a batch.
 
     Args:
         threads: how many; None for one a core.
@@ -73,7 +72,7 @@ class Workers:
         self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
 
     def each(self, call: Callable[[_Item], object], items: Collection[_Item]) -> None:
-        """Call for every item and wait for all; which thread takes which is left open."""
+        """Call for every item and wait for all; any thread may take any item."""
         for _ in map(call, items) if self._pool is None or len(items) < 2 else self._pool.map(call, items):
             pass
 
@@ -98,7 +97,7 @@ class Observed(NamedTuple):
 
     @classmethod
     def zeros(cls, count: int) -> Observed:
-        """Of ``count`` slots, nothing seen yet."""
+        """Zeros for ``count`` slots."""
         return cls(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, 2)))
 
 
@@ -130,8 +129,8 @@ class _Block:
         self._copies.append((self.batch.bind(field), target))
 
     def place(self, rows: np.ndarray, start: Start) -> None:
-        """Put the simulations ``rows`` into their start states."""
-        self._guarded(self.batch.reset, rows, stage=_NOTHING)
+        """Set the simulations ``rows`` to their start states."""
+        self._guarded(self.batch.reset, rows, stage=_NO_STAGE)
         self.batch.warning[rows] = 0
         for row in rows.tolist():
             self._errors.pop(row, None)
@@ -142,21 +141,21 @@ class _Block:
         self._controllers.rearm(rows, fresh=not start.settled)
         if start.settled:
             self._controllers.memory["fingers"][rows] = _OPEN
-        self.refresh(_EVERYTHING, rows)
+        self.refresh(_ALL_STAGES, rows)
         self._observe_pose(rows)
         self._observe_fingers(rows)
 
     def write_state(self, qpos: np.ndarray, qvel: np.ndarray, time: np.ndarray) -> None:
         """Overwrite positions, velocities and time of all rows."""
         self._qpos[:], self._qvel[:], self._time[:] = qpos, qvel, time
-        self.refresh(_EVERYTHING)
+        self.refresh(_ALL_STAGES)
         self._observe_pose(None)
         self._observe_fingers(None)
 
     def refresh(self, stage: int, rows: _Rows = None) -> None:
-        """Compute the present state up to a stage and show it."""
+        """Compute the current state up to a stage and copy the fields."""
         self._guarded(self.batch.forward, rows, stage=stage)
-        self._show()
+        self._copy_fields()
 
     def control_step(self, actions: np.ndarray, active: np.ndarray) -> None:
         """25 substeps of the active rows, bool [n], with their actions [n, 7]."""
@@ -165,15 +164,15 @@ class _Block:
         self._controllers.take_actions(actions, active)
         for substep in range(1, SUBSTEPS + 1):
             self._controllers.command(active)
-            self._guarded(self.batch.step, rows, stage=_NOTHING if substep == SUBSTEPS else _POSITION_AND_VELOCITY)
+            self._guarded(self.batch.step, rows, stage=_NO_STAGE if substep == SUBSTEPS else _POSITION_AND_VELOCITY)
             if substep == OBSERVED_POSE:
                 self._observe_pose(rows)
             elif substep == OBSERVED_FINGERS:
                 self._observe_fingers(rows)
-        self._show()
+        self._copy_fields()
 
     def faults(self) -> list[tuple[int, str]]:
-        """Rows that MuJoCo raised in or warned about since their start, and why."""
+        """Rows in which MuJoCo raised or warned since their start, and the cause."""
         found = list(self._errors.items())
         counts = self.batch.warning[:, :, 1]
         if counts.any():
@@ -182,14 +181,14 @@ class _Block:
         return found
 
     def _guarded(self, call: Callable[..., None], rows: _Rows, *, stage: int) -> None:
-        """Call; a simulation in which MuJoCo raises becomes a fault of its slot."""
+        """Call; where MuJoCo raises, the slot of that simulation gets a fault."""
         try:
             call(rows, stage=stage)
         except SimulationError as error:
             for row in error.ids.tolist():
                 self._errors.setdefault(row, f"MuJoCo: {self.batch.error(row)}")
 
-    def _show(self) -> None:
+    def _copy_fields(self) -> None:
         for live, target in self._copies:
             target[:] = live
 
@@ -266,7 +265,7 @@ class Group:
             block, owned = job
             mine = (rows >= owned.start) & (rows < owned.stop)
             if mine.any():
-                block.place(rows[mine] - owned.start, _some(start, mine))
+                block.place(rows[mine] - owned.start, start.select(mine))
 
         self._workers.each(place, list(zip(self.blocks, self._rows, strict=True)))
 
@@ -276,22 +275,16 @@ class Group:
             block.write_state(qpos[rows], qvel[rows], time[rows])
 
     def refresh_kinematics(self) -> None:
-        """Bring the kinematics up to the present state."""
+        """Compute the kinematics of the current state."""
         self._workers.each(lambda block: block.refresh(_POSITION_AND_VELOCITY), self.blocks)
 
     def refresh_all(self) -> None:
-        """Bring kinematics, contacts and contact sensors up to the present state."""
-        self._workers.each(lambda block: block.refresh(_EVERYTHING), self.blocks)
+        """Compute kinematics, contacts and contact sensors of the current state."""
+        self._workers.each(lambda block: block.refresh(_ALL_STAGES), self.blocks)
 
     def faults(self) -> list[tuple[int, str]]:
-        """Slots that MuJoCo raised in or warned about since their start, and why."""
+        """Slots in which MuJoCo raised or warned since their start, and the cause."""
         return [(int(block.slots[row]), reason) for block in self.blocks for row, reason in block.faults()]
-
-
-def _some(start: Start, chosen: np.ndarray) -> Start:
-    """The starts of the chosen slots, bool [n]."""
-    given = {name: getattr(start, name) for name in ("qpos", "qvel", "body_pos", "body_quat")}
-    return dataclasses.replace(start, **{name: array[chosen] for name, array in given.items()})
 
 
 def arm_views(scene: Scene, batch: Batch) -> ArmViews:
@@ -341,7 +334,7 @@ class NativePhysics(Physics):
         num_threads: threads; None for one a core.
 
     Raises:
-        ColliderError: the scenes have published contacts, and this MuJoCo cannot be taught them.
+        ColliderError: the scenes have published contacts, and the installed MuJoCo does not support them.
     """
 
     def __init__(self, scenes: Sequence[Scene], scene_of_slot: np.ndarray, num_threads: int | None = None) -> None:
@@ -375,7 +368,7 @@ class NativePhysics(Physics):
         return self._observed().fingers
 
     def place(self, group: Group, slots: np.ndarray, start: Start) -> None:
-        """Begin an episode in ``slots``, all of ``group``: physics state, fixture poses, controller memory."""
+        """Begin an episode in ``slots``, which belong to ``group``: physics state, fixture poses, controller memory."""
         for slot in slots.tolist():
             self.faults.pop(slot, None)
         group.place(np.searchsorted(group.slots, slots), start)
@@ -403,7 +396,7 @@ class NativePhysics(Physics):
         self._workers.close()
 
     def _observed(self) -> Observed:
-        """Of all groups, in the caller's order of slots."""
+        """Proprioception of all groups, in the caller's order of slots."""
         whole = Observed.zeros(self.num_envs)
         for group in self.groups:
             for target, values in zip(whole, group.observed, strict=True):
@@ -417,6 +410,6 @@ class NativePhysics(Physics):
 
 
 def _block_size(slots: int, threads: int) -> int:
-    """At most ``BLOCK`` slots, and such that the blocks of one scene share out evenly over the threads."""
+    """At most ``BLOCK`` slots, so that the blocks of one scene are spread evenly over the threads."""
     rounds = math.ceil(slots / (threads * BLOCK))
     return math.ceil(slots / (threads * rounds))

@@ -1,4 +1,4 @@
-"""Starts brought to rest here: stored init states after ten idle control ticks, wherever their fixtures stand.
+"""Settled starts: stored init states after ten idle control ticks, for any fixture poses.
 
 Init states are stored before things have settled, and LIBERO's evaluations let them settle with the arm idle. With
 fixtures at the centres of their regions the result ships with the package (``vecenv.libero.tasks.settled``); for any
@@ -18,16 +18,16 @@ import numpy as np
 
 from vecenv.errors import SimulationError
 from vecenv.libero.physics.base import SETTLE_ACTION, SETTLE_TICKS, Start
-from vecenv.libero.scene import cache
 from vecenv.libero.scene.scene import Scene
 from vecenv.libero.tasks.settled import TIME
+from vecenv.util import caching
 
-# Part of the key: raised when what is computed changes.
+# Part of the key: increased when the computation changes.
 VERSION = 1
 
 
 class SettlingError(SimulationError):
-    """A start that does not come to rest; the message names the row and what failed."""
+    """A start that cannot be settled; the message names the row and the fault."""
 
 
 def at_rest(scene: Scene, starts: Start) -> Start:
@@ -44,7 +44,7 @@ def at_rest(scene: Scene, starts: Start) -> Start:
     states = [_read(key, scene.model.nq + scene.model.nv) for key in keys]
     missing = [row for row, state in enumerate(states) if state is None]
     if missing:
-        for row, state in zip(missing, _settle(scene, starts.some(np.array(missing))), strict=True):
+        for row, state in zip(missing, _settle(scene, starts.select(np.array(missing))), strict=True):
             states[row] = state
             _write(keys[row], state)
     settled = np.stack([state for state in states if state is not None])
@@ -79,7 +79,7 @@ def _settle(scene: Scene, starts: Start) -> np.ndarray:
 
 
 def _keys(model: mujoco.MjModel, starts: Start) -> list[str]:
-    """A hash for each start of all that its settled state depends on."""
+    """For each start, a hash of everything its settled state depends on."""
     buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     common = hashlib.sha256(repr((VERSION, SETTLE_TICKS, SETTLE_ACTION.tolist(), mujoco.__version__)).encode())
@@ -95,12 +95,12 @@ def _keys(model: mujoco.MjModel, starts: Start) -> list[str]:
 
 
 def _path(key: str) -> Path | None:
-    folder = cache.folder()
-    return None if folder is None else folder.with_name("settled") / f"{key}.npy"
+    folder = caching.folder("settled")
+    return None if folder is None else folder / f"{key}.npy"
 
 
 def _read(key: str, width: int) -> np.ndarray | None:
-    """A state [nq + nv] from the cache; None where there is none, or a damaged one."""
+    """A state [nq + nv] from the cache; None if it is missing or damaged."""
     path = _path(key)
     with contextlib.suppress(OSError, ValueError, EOFError):
         state = None if path is None else np.load(path, allow_pickle=False)
@@ -116,4 +116,4 @@ def _write(key: str, state: np.ndarray) -> None:
     np.save(buffer, state)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        cache.write_file(path, buffer.getvalue())
+        caching.write_file(path, buffer.getvalue())

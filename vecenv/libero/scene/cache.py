@@ -7,8 +7,7 @@ ever out of date. Files appear whole (written elsewhere, then renamed), any numb
 folder, what is damaged is compiled again, and a folder that cannot be written is no error. Exported folders
 (``vecenv.libero.tasks.export``) hold their scenes in the same two files.
 
-The folder is the user's cache folder (``~/.cache/vecenv`` on Linux); ``VECENV_CACHE_DIR`` names another one, and set to
-nothing turns the cache off. Deleting it is safe at any time.
+``vecenv.util.caching`` says where the folder is.
 """
 
 from __future__ import annotations
@@ -18,9 +17,7 @@ import functools
 import hashlib
 import html
 import json
-import os
 import re
-import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -29,7 +26,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import platformdirs
 
 from vecenv.errors import InvalidFile
 from vecenv.libero.scene.arenas import ARENAS
@@ -37,8 +33,8 @@ from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.contacts import Contacts
 from vecenv.libero.scene.lean import geometry
 from vecenv.libero.scene.scene import Entity, RegionSite, Scene, SceneSource, scene_source
+from vecenv.util import caching
 
-VARIABLE = "VECENV_CACHE_DIR"
 # Layout of the two files; raised when it changes.
 FORMAT = 2
 
@@ -48,15 +44,6 @@ _FILE = re.compile(r' file="([^"]*)"')
 
 class SceneFileError(InvalidFile):
     """A stored scene is missing, damaged, or made by another version of MuJoCo; the message names the file."""
-
-
-def folder() -> Path | None:
-    """Where scenes are cached; None when the cache is off."""
-    chosen = os.environ.get(VARIABLE)
-    if chosen is not None:
-        return Path(chosen).expanduser() / "scenes" if chosen else None
-    default = platformdirs.user_cache_path("vecenv") / "scenes"
-    return default if default.is_absolute() else None  # "~" stays in it for a user without a home
 
 
 def cached_scene(
@@ -75,7 +62,7 @@ def cached_scene(
         upstream's.
         contacts: as for ``compile_scene``.
     """
-    source, where = scene_source(problem, contact_pairs=contact_pairs, contacts=contacts), folder()
+    source, where = scene_source(problem, contact_pairs=contact_pairs, contacts=contacts), caching.folder("scenes")
     asked = None if lean_for is None else geometry.demands(lean_for)
     try:
         key = None if where is None else content_key(source, asked)
@@ -145,8 +132,8 @@ def write_scene(where: Path, key: str, scene: Scene) -> None:
     names, data = _names(scene), buffer.tobytes()
     described = {"format": FORMAT, "mujoco": mujoco.__version__, "sha256": _checksum(data, names), **names}
     where.mkdir(parents=True, exist_ok=True)
-    write_file(where / f"{key}.mjb", data)
-    write_file(where / f"{key}.json", json.dumps(described, indent=1).encode())
+    caching.write_file(where / f"{key}.mjb", data)
+    caching.write_file(where / f"{key}.json", json.dumps(described, indent=1).encode())
 
 
 def read_scene(where: Path, key: str) -> Scene:
@@ -200,17 +187,3 @@ def _tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
 def _checksum(data: bytes, names: Mapping[str, Any]) -> str:
     """Over both files' contents: MuJoCo reads a damaged model without complaint, or crashes."""
     return hashlib.sha256(json.dumps(names).encode() + data).hexdigest()
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file so that others see the old one, the new one or none, never a part.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    try:
-        partial.write_bytes(data)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

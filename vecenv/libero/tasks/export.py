@@ -24,13 +24,14 @@ import numpy as np
 from vecenv.errors import InvalidFile
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import Problem, SceneKey, parse_problem
-from vecenv.libero.scene.cache import SceneFileError, compiled_source, content_key, read_scene, write_file, write_scene
+from vecenv.libero.scene.cache import SceneFileError, compiled_source, content_key, read_scene, write_scene
 from vecenv.libero.scene.contacts import Contacts, checked
 from vecenv.libero.scene.lean.geometry import PROFILES, demands
 from vecenv.libero.scene.scene import Scene, scene_source
 from vecenv.libero.tasks import settled
 from vecenv.libero.tasks.settled import SettledStarts
 from vecenv.libero.tasks.suites import TaskSpec, list_suites, list_tasks
+from vecenv.util import caching
 
 INDEX, SCENES, STARTS = "index.json", "scenes", "starts"
 # Layout of the folder; raised when it changes.
@@ -105,7 +106,7 @@ def export(
     }
     entries = {suite: _write_suite(folder, tasks[suite], ids) for suite in track(list(tasks), "starts")}
     index = {"format": FORMAT, "mujoco": mujoco.__version__, "contacts": contacts, "suites": entries}
-    write_file(folder / INDEX, json.dumps(index, indent=1).encode())
+    caching.write_file(folder / INDEX, json.dumps(index, indent=1).encode())
     return Exported(
         folder=folder,
         suites=len(tasks),
@@ -158,7 +159,7 @@ def _write_suite(
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     data = buffer.getvalue()
-    write_file(folder / STARTS / f"{specs[0].suite}.npz", data)
+    caching.write_file(folder / STARTS / f"{specs[0].suite}.npz", data)
     entries = [
         {
             "name": spec.name,

@@ -18,7 +18,8 @@ more than what rounding makes of it.
 from __future__ import annotations
 
 import warp as wp
-from mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core import mat83f, vec8f
+
+from vecenv.libero.physics.mjx.private import mat83f, vec8f
 
 MOST = 8
 # Squared sine below which the cross product of two edges is noise.

@@ -2,11 +2,11 @@
 
 MuJoCo calls the collider of two geoms through a table of function pointers, ``mjCOLLISIONFUNC``. The table belongs to
 the whole process, so its entries for two boxes and for a mesh on a plane become functions that look at the model first:
-one that carries the mark of ``vecenv.libero.scene.contacts`` gets the contacts of ``boxbox.py`` and ``planemesh.py``,
-any other the collider that was there before, unchanged. The functions are compiled, take no lock and allocate nothing.
+a model with the mark of ``vecenv.libero.scene.contacts`` gets the contacts of ``boxbox.py`` and ``planemesh.py``, any
+other gets MuJoCo's own collider, unchanged. The functions are compiled, take no lock and allocate nothing.
 
-Where the fields they read lie inside ``mjModel`` and ``mjData`` is measured on a small model, not assumed, and the
-result is tried before it is kept: a MuJoCo that calls its colliders in another way is refused with ``ColliderError``.
+The offsets of the fields they read in ``mjModel`` and ``mjData`` are measured on a small model, and the result is
+tested before it is kept: a MuJoCo that calls its colliders in another way is refused with ``ColliderError``.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from numba import types
 from numba.core import cgutils
 
 from vecenv.errors import SimulationError
-from vecenv.libero.physics.colliders import boxbox, planemesh
+from vecenv.libero.physics.colliders import boxbox, boxbox_numba, planemesh
 from vecenv.libero.scene.contacts import MARK, mark
-from vecenv.util.compiled import address_at, builtin, compile_for_c, floats_at, int32_at, part
+from vecenv.util.compiled import address_at, compile_for_c, floats_at, int32_at, intrinsic_with_literals, part
 
 _PLANE, _BOX, _MESH = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "BOX", "MESH"))
 _GEOM_TYPES = int(mujoco.mjtGeom.mjGEOM_SDF) + 1
@@ -40,7 +40,7 @@ _LOCK = threading.Lock()
 
 
 class ColliderError(SimulationError):
-    """This MuJoCo's collision table cannot be used; the message says what was found and what to do."""
+    """The collision table of the installed MuJoCo cannot be used; the message says what was found and what to do."""
 
 
 # What the compiled functions read: addresses of colliders, bytes from the start of mjData or mjModel to a field.
@@ -67,28 +67,28 @@ def install() -> None:
     """Put the colliders into MuJoCo's table, once a process.
 
     Raises:
-        ColliderError: another layout than is understood, or a collider does not answer as it should.
+        ColliderError: the layout is unknown, or a collider returns wrong contacts.
     """
     with _LOCK:
         table = _table()
         boxes, meshes = table[_BOX][_BOX], table[_PLANE][_MESH]
         if not boxes or not meshes:
-            raise _unknown("its collision table has no collider for two boxes, or none for a mesh on a plane")
-        ours = boxbox.compiled().address, planemesh.compiled().address
+            raise _unsupported("its collision table has no collider for two boxes, or none for a mesh on a plane")
+        ours = boxbox_numba.compiled().address, planemesh.compiled().address
         entries = [boxes, meshes, *ours, int(np.float64(MARK).view(np.int64)), *_offsets()]
         _LAYOUT[: len(entries)] = entries
         llvm.add_symbol(_SYMBOL, _LAYOUT.ctypes.data)
         table[_BOX][_BOX], table[_PLANE][_MESH] = (compiled.address for compiled in _compiled())
         try:
-            _try_it()
+            _verify()
         except BaseException:
             table[_BOX][_BOX], table[_PLANE][_MESH] = boxes, meshes
             raise
 
 
-def _unknown(found: str) -> ColliderError:
+def _unsupported(found: str) -> ColliderError:
     return ColliderError(
-        f"contacts='published' cannot be had from MuJoCo {mujoco.__version__}: {found}; use contacts='current', "
+        f"MuJoCo {mujoco.__version__} does not support contacts='published': {found}; use contacts='current', "
         "or a MuJoCo that this version of vecenv was tested with (3.17)"
     )
 
@@ -98,15 +98,15 @@ def _table() -> Any:
     folder = Path(mujoco.__file__).parent
     names = [*folder.glob("libmujoco*.so*"), *folder.glob("libmujoco*.dylib"), *folder.glob("mujoco.dll")]
     if not names:
-        raise _unknown(f"no MuJoCo library in {folder}")
+        raise _unsupported(f"no MuJoCo library in {folder}")
     try:
         return ((ctypes.c_void_p * _GEOM_TYPES) * _GEOM_TYPES).in_dll(ctypes.CDLL(str(names[0])), "mjCOLLISIONFUNC")
     except ValueError as error:
-        raise _unknown("its library does not export mjCOLLISIONFUNC") from error
+        raise _unsupported("its library does not export mjCOLLISIONFUNC") from error
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Where things are.
+# Offsets of fields.
 
 _PROBE = """
 <mujoco>
@@ -136,27 +136,27 @@ def _offsets() -> list[int]:
         for name, kind in fields.items():
             array = getattr(owner, name)
             if array.dtype != kind:
-                raise _unknown(f"the field {name} is of type {array.dtype}")
+                raise _unsupported(f"the field {name} is of type {array.dtype}")
             found.append(_find(owner._address, array.ctypes.data, name, ctypes.c_uint64))
     return found
 
 
 def _find(start: int, value: int, name: str, kind: Any) -> int:
-    """Bytes from ``start`` to the field that holds a value; nothing behind it is read."""
+    """Bytes from ``start`` to the field that holds a value; nothing after it is read."""
     width = ctypes.sizeof(kind)
     for offset in range(0, _REACH, width):
         if kind.from_address(start + offset).value == value:
             break
     else:
-        raise _unknown(f"the field {name} was not found")
+        raise _unsupported(f"the field {name} was not found")
     # Arrays without entries share the address of what follows them: the last of them is the one.
     while kind.from_address(start + offset + width).value == value:
         offset += width
     return offset
 
 
-def _try_it() -> None:
-    """Hold what MuJoCo now answers for a marked and an unmarked model against what it should."""
+def _verify() -> None:
+    """Compare MuJoCo's contacts of a marked and an unmarked model with the expected ones."""
     model, data = _probe(1)
     mujoco.mj_forward(model, data)
     boxes, meshes = _rows(model, data, _BOX), _rows(model, data, _MESH)
@@ -165,13 +165,13 @@ def _try_it() -> None:
     poses = [(data.geom_xpos[i], data.geom_xmat[i], model.geom_size[i]) for i in (0, 2)]
     wanted = boxbox.box_box(*poses[0], *poses[1])
     if not len(wanted) or not np.array_equal(_rows(model, data, _BOX), wanted):
-        raise _unknown("our contacts of two boxes do not arrive")
+        raise _unsupported("it does not return our contacts of two boxes")
     # Both have the four corners of the upper box's face; those of MuJoCo 3.4 and later are twice as deep.
     if len(boxes) != len(wanted) or not np.allclose(np.sort(boxes[:, 0]), 2 * np.sort(wanted[:, 0]), rtol=1e-6):
-        raise _unknown("its own contacts of two boxes are not what they were")
+        raise _unsupported("its own contacts of two boxes have changed")
     lowest, published = meshes[:, 0].min(initial=0), _rows(model, data, _MESH)
     if not len(published) or not np.isclose(published[0, 0], lowest, rtol=1e-9):
-        raise _unknown("our contacts of a mesh on a plane do not arrive")
+        raise _unsupported("it does not return our contacts of a mesh on a plane")
 
 
 def _rows(model: mujoco.MjModel, data: mujoco.MjData, kind: int) -> np.ndarray:
@@ -194,7 +194,7 @@ def _compiled() -> tuple[Any, Any]:
     return compile_for_c(signature, _box_box), compile_for_c(signature, _plane_mesh)
 
 
-@builtin
+@intrinsic_with_literals
 def _layout(typingctx: Any, index: Any) -> Any:
     """An entry of ``_LAYOUT``."""
 
@@ -207,7 +207,7 @@ def _layout(typingctx: Any, index: Any) -> Any:
     return types.uintp(types.int64), codegen
 
 
-@builtin
+@intrinsic_with_literals
 def _call(typingctx: Any, function: Any, arguments: Any) -> Any:
     """Call a C function that returns an int32 by its address, with a tuple of arguments."""
 

@@ -14,15 +14,14 @@ without a hull.
 from __future__ import annotations
 
 import warp as wp
-from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive
-from mujoco.mjx.third_party.mujoco_warp._src.collision_core import Geom
-from mujoco.mjx.third_party.mujoco_warp._src.types import mat43
+
+from vecenv.libero.physics.mjx.private import Geom, mat43, warp_collision_primitive
 
 MOST = 3
 _APART = 0.3
 _FAR = 1e10
 
-_without_hull = collision_primitive.plane_convex
+_without_hull = warp_collision_primitive.plane_convex
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,1 +1,1 @@
-"""MJX as a backend: model, control step, rollout."""
+"""MJX as a backend: options, model, control step, rollouts, batch."""
