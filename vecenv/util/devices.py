@@ -30,8 +30,7 @@ class Spread:
     """A function of rows, run on every device of a mesh.
 
     Args:
-        function: a compiled function, which runs on the device of its arguments. Rows are
-            the first axis of every output.
+        function: a compiled function, which runs on the device of its arguments. Every output has rows first.
         mesh: the devices, one axis.
         shared: how many of the first arguments are the same for all rows.
     """

@@ -127,10 +127,10 @@ def test_a_mujoco_with_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_mujoco_that_calls_its_colliders_in_another_way_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    collider._try_it()
+    collider._verify()
     monkeypatch.setattr(collider.boxbox, "box_box", lambda *_: np.ones((4, 7)))
-    with pytest.raises(ColliderError, match="do not arrive"):
-        collider._try_it()
+    with pytest.raises(ColliderError, match="does not return our contacts"):
+        collider._verify()
 
 
 def test_bad_values_are_refused_with_the_allowed_ones() -> None:
