@@ -149,20 +149,20 @@ class _Frames(NamedTuple):
 
     mat: Float[Array, "3 3 7 *B"]
     pos: Float[Array, "3 7 *B"]
-    eef: Float[Array, 3 * B]
+    eef: Float[Array, "xyz=3 *B"]
 
 
 class _Inertias(NamedTuple):
     """Spatial inertias of k bodies: mass [k, ...], mass times centre [3, k, ...], second moments [3, 3, k, ...]."""
 
-    mass: Float[Array, k * B]
+    mass: Float[Array, "k ..."]
     first: Float[Array, "3 k *B"]
     second: Float[Array, "3 3 k *B"]
 
 
 def _hand_last(
-    chain: Chain, qpos: Float[Array, 9 * B], *, fence: bool
-) -> tuple[Float[Array, 3 * B], Float[Array, 4 * B]]:
+    chain: Chain, qpos: Float[Array, "dof=9 *B"], *, fence: bool
+) -> tuple[Float[Array, "xyz=3 *B"], Float[Array, "wxyz=4 *B"]]:
     """Position of the site and orientation of the hand."""
     turns = stage(fence, _hinge_quats, chain, qpos)
     turn = reduce(partial(stage, fence, _quat_product), [turns[:, i] for i in range(NUM_JOINTS)])
@@ -170,13 +170,13 @@ def _hand_last(
 
 
 def _arm_last(
-    chain: Chain, qpos: Float[Array, 9 * B], qvel: Float[Array, 9 * B], *, fence: bool
+    chain: Chain, qpos: Float[Array, "dof=9 *B"], qvel: Float[Array, "dof=9 *B"], *, fence: bool
 ) -> tuple[
-    Float[Array, 3 * B],
+    Float[Array, "xyz=3 *B"],
     Float[Array, "3 3 *B"],
     Float[Array, "6 7 *B"],
     Float[Array, "7 7 *B"],
-    Float[Array, 7 * B],
+    Float[Array, "dof=7 *B"],
 ]:
     """Position and orientation of the site, Jacobian, mass matrix and bias."""
     frames = _frames(chain, qpos, fence)
@@ -188,14 +188,14 @@ def _arm_last(
     return pos, mat, jacobian, mass_matrix, stage(fence, _project, screws, force)
 
 
-def _frames(chain: Chain, qpos: Float[Array, 9 * B], fence: bool) -> _Frames:
+def _frames(chain: Chain, qpos: Float[Array, "dof=9 *B"], fence: bool) -> _Frames:
     mat = stage(fence, _hinge_mats, chain, qpos)
     for reach in (1, 2, 4):
         mat = stage(fence, partial(_compose, reach=reach), mat)
     return stage(fence, _place, chain, mat)
 
 
-def _hinge_mats(chain: Chain, qpos: Float[Array, 9 * B]) -> Float[Array, "3 3 7 *B"]:
+def _hinge_mats(chain: Chain, qpos: Float[Array, "dof=9 *B"]) -> Float[Array, "3 3 7 *B"]:
     """Rotation of each hinge since the reference configuration, [3, 3, 7, ...] (Rodrigues' formula).
 
     Matrices, not quaternions: in float32 the site's position is then off by 4e-8 m instead of 6e-8 (root mean square).
@@ -212,7 +212,7 @@ def _compose(mat: Float[Array, "3 3 7 *B"], *, reach: int) -> Float[Array, "3 3 
     return jnp.concatenate([mat[:, :, :reach], _product(mat[:, :, :-reach], mat[:, :, reach:])], axis=2)
 
 
-def _hinge_quats(chain: Chain, qpos: Float[Array, 9 * B]) -> Float[Array, "4 7 *B"]:
+def _hinge_quats(chain: Chain, qpos: Float[Array, "dof=9 *B"]) -> Float[Array, "4 7 *B"]:
     """The same as quaternions, [4, 7, ...]."""
     half = 0.5 * (qpos - chain.reference)[:NUM_JOINTS]
     return jnp.concatenate([jnp.cos(half)[None], chain.axis * jnp.sin(half)[None]])
@@ -259,7 +259,7 @@ def _site(chain: Chain, frames: _Frames) -> tuple[jax.Array, jax.Array, jax.Arra
     return chain.base + frames.eef, mat, jacobian, jnp.concatenate([axis, cross(frames.pos, axis)])
 
 
-def _inertias(chain: Chain, frames: _Frames, qpos: Float[Array, 9 * B]) -> _Inertias:
+def _inertias(chain: Chain, frames: _Frames, qpos: Float[Array, "dof=9 *B"]) -> _Inertias:
     """Inertias of the nine bodies."""
     mat, origin = jnp.stack([_with_fingers(row) for row in frames.mat]), _with_fingers(frames.pos)
     slid = chain.slide * (qpos - chain.reference)[None, NUM_JOINTS:]
@@ -275,7 +275,7 @@ def _with_fingers(x: Float[Array, "c 7 *B"]) -> Float[Array, "c 9 *B"]:
     return jnp.concatenate([x, x[:, -1:], x[:, -1:]], axis=1)
 
 
-def _point_moments(first: Float[Array, 3 * B], com: Float[Array, 3 * B]) -> Float[Array, "3 3 *B"]:
+def _point_moments(first: Float[Array, "xyz=3 *B"], com: Float[Array, "xyz=3 *B"]) -> Float[Array, "3 3 *B"]:
     """Second moments [3, 3, ...] of point masses at ``com`` [3, ...]; ``first`` is mass times ``com``."""
     across = first[:, None] * com[None]
     trace = across[0, 0] + across[1, 1] + across[2, 2]
@@ -308,7 +308,7 @@ def _backward_sum(x: Float[Array, "c 9 *B"]) -> Float[Array, "c 7 *B"]:
 
 
 def _twists(
-    chain: Chain, frames: _Frames, screws: Float[Array, "6 7 *B"], qvel: Float[Array, 9 * B]
+    chain: Chain, frames: _Frames, screws: Float[Array, "6 7 *B"], qvel: Float[Array, "dof=9 *B"]
 ) -> tuple[Float[Array, "6 9 *B"], Float[Array, "6 9 *B"]]:
     """Twists of the nine bodies, and what each body's own joint adds to them, [6, 9, ...]."""
     slide = _rotate(frames.mat[:, :, -1:], chain.slide) * qvel[None, NUM_JOINTS:]
@@ -338,6 +338,6 @@ def _forces(
     return _momentum(inertias, lifted) + gyroscopic
 
 
-def _project(screws: Float[Array, "6 7 *B"], force: Float[Array, "6 9 *B"]) -> Float[Array, 7 * B]:
+def _project(screws: Float[Array, "6 7 *B"], force: Float[Array, "6 9 *B"]) -> Float[Array, "dof=7 *B"]:
     """Torques of the hinges, [7, ...]: each carries the forces on everything behind it."""
     return sum_rows(screws * _backward_sum(force))

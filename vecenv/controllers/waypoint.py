@@ -159,8 +159,9 @@ def _advance(reference: Pose, target: Pose, config: WaypointConfig) -> Pose:
     return Pose(reference.pos + step, _turn(reference.quat, turn))
 
 
-def _bounded(vector: Float[Array, "*B 3"], length: float) -> Float[Array, "*B 3"]:
+def _bounded(vector: Float[AnyArray, "*B 3"], length: float) -> Float[Array, "*B 3"]:
     """Vectors [..., 3] shortened to at most ``length``."""
+    vector = jnp.asarray(vector)
     norm = safe_norm(vector)[..., None]
     return vector * jnp.where(norm > length, length / jnp.where(norm > length, norm, 1), 1)
 
