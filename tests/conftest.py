@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import jaxtyping
 import pytest
 from hypothesis import settings
@@ -32,6 +33,13 @@ def _cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None
     """Compiled scenes go to a folder of this run, not to the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VECENV_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def no_rank_promotion() -> Iterator[None]:
+    """Arrays of different rank do not broadcast (MJX itself relies on that, so this is not for all tests)."""
+    with jax.numpy_rank_promotion("raise"):
         yield
 
 

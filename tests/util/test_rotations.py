@@ -16,6 +16,8 @@ from vecenv.util import rotations
 NEAR_HALF_TURNS = [np.pi, np.pi - 1e-9, np.pi - 1e-4]
 SMALL_TURNS = [0.0, 1e-300, 1e-9, 1e-4]
 
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
+
 
 def scipy_of(quat: Any) -> Rotation:
     return Rotation.from_quat(np.asarray(quat)[..., [1, 2, 3, 0]])

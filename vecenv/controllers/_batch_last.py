@@ -42,7 +42,7 @@ def stage(fence: bool, function: Callable[..., Any], *args: Any) -> Any:
         return jax.jit(without_mark)(*args)
 
 
-def sum_rows(x: Float[Array, k * B]) -> Float[Array, "*B"]:
+def sum_rows(x: Float[Array, "k ..."]) -> Float[Array, "..."]:
     """Sum of [k, ...] over axis 0 in a fixed order, elementwise over the rest."""
     total = x[0]
     for i in range(1, x.shape[0]):

@@ -55,9 +55,9 @@ def integrate(
     """
     state, action = jnp.asarray(state), jnp.asarray(action)
     require_tail("gripper state", state, (2,))
-    step = jnp.asarray([config.speed * side for side in _CLOSING], state.dtype)
+    step = [config.speed * side for side in _CLOSING]
     direction = jnp.sign(action).astype(state.dtype)
-    return jnp.clip(state + step * direction[..., None], -1, 1)
+    return jnp.clip(state + jnp.stack([speed * direction for speed in step], axis=-1), -1, 1)
 
 
 def command(state: Float[AnyArray, "*B 2"], config: GripperConfig = PANDA_GRIPPER) -> Float[Array, "*B 2"]:
@@ -77,4 +77,4 @@ def command(state: Float[AnyArray, "*B 2"], config: GripperConfig = PANDA_GRIPPE
     require_tail("gripper state", state, (2,))
     middle = [0.5 * (high + low) for low, high in zip(config.ctrl_low, config.ctrl_high, strict=True)]
     half = [0.5 * (high - low) for low, high in zip(config.ctrl_low, config.ctrl_high, strict=True)]
-    return jnp.asarray(middle, state.dtype) + jnp.asarray(half, state.dtype) * state
+    return jnp.stack([middle[i] + half[i] * state[..., i] for i in range(2)], axis=-1)

@@ -58,7 +58,9 @@ def set_goal(
     require_tail("qpos", qpos, (7,))
     require_tail("action", action, (7,))
     require_tail("limits", limits, (2, 7))
-    return jnp.clip(qpos + config.max_delta * jnp.clip(action, -1, 1), limits[0], limits[1])
+    target = qpos + config.max_delta * jnp.clip(action, -1, 1)
+    low, high = (jnp.broadcast_to(limit, target.shape) for limit in limits)
+    return jnp.clip(target, low, high)
 
 
 def torques(
@@ -75,5 +77,5 @@ def torques(
     acceleration = config.kp * (goal - arm.qpos) - damping * arm.qvel
     # Summed by hand: a GPU may multiply matrices in TF32.
     raw = jnp.sum(arm.mass_matrix * acceleration[..., None, :], axis=-1) + arm.bias
-    limit = jnp.asarray(config.torque_limit, raw.dtype)
+    limit = jnp.broadcast_to(jnp.asarray(config.torque_limit, raw.dtype), raw.shape)
     return jnp.clip(raw, -limit, limit)

@@ -149,20 +149,20 @@ class _Frames(NamedTuple):
 
     mat: Float[Array, "3 3 7 *B"]
     pos: Float[Array, "3 7 *B"]
-    eef: Float[Array, 3 * B]
+    eef: Float[Array, "xyz=3 *B"]
 
 
 class _Inertias(NamedTuple):
     """Spatial inertias of k bodies: mass [k, ...], mass times centre [3, k, ...], second moments [3, 3, k, ...]."""
 
-    mass: Float[Array, k * B]
+    mass: Float[Array, "k ..."]
     first: Float[Array, "3 k *B"]
     second: Float[Array, "3 3 k *B"]
 
 
 def _hand_last(
-    chain: Chain, qpos: Float[Array, 9 * B], *, fence: bool
-) -> tuple[Float[Array, 3 * B], Float[Array, 4 * B]]:
+    chain: Chain, qpos: Float[Array, "dof=9 *B"], *, fence: bool
+) -> tuple[Float[Array, "xyz=3 *B"], Float[Array, "wxyz=4 *B"]]:
     """Position of the site and orientation of the hand."""
     turns = stage(fence, _hinge_quats, chain, qpos)
     turn = reduce(partial(stage, fence, _quat_product), [turns[:, i] for i in range(NUM_JOINTS)])
@@ -170,13 +170,13 @@ def _hand_last(
 
 
 def _arm_last(
-    chain: Chain, qpos: Float[Array, 9 * B], qvel: Float[Array, 9 * B], *, fence: bool
+    chain: Chain, qpos: Float[Array, "dof=9 *B"], qvel: Float[Array, "dof=9 *B"], *, fence: bool
 ) -> tuple[
-    Float[Array, 3 * B],
+    Float[Array, "xyz=3 *B"],
     Float[Array, "3 3 *B"],
     Float[Array, "6 7 *B"],
     Float[Array, "7 7 *B"],
-    Float[Array, 7 * B],
+    Float[Array, "dof=7 *B"],
 ]:
     """Position and orientation of the site, Jacobian, mass matrix and bias."""
     frames = _frames(chain, qpos, fence)
@@ -188,22 +188,23 @@ def _arm_last(
     return pos, mat, jacobian, mass_matrix, stage(fence, _project, screws, force)
 
 
-def _frames(chain: Chain, qpos: Float[Array, 9 * B], fence: bool) -> _Frames:
+def _frames(chain: Chain, qpos: Float[Array, "dof=9 *B"], fence: bool) -> _Frames:
     mat = stage(fence, _hinge_mats, chain, qpos)
     for reach in (1, 2, 4):
         mat = stage(fence, partial(_compose, reach=reach), mat)
     return stage(fence, _place, chain, mat)
 
 
-def _hinge_mats(chain: Chain, qpos: Float[Array, 9 * B]) -> Float[Array, "3 3 7 *B"]:
+def _hinge_mats(chain: Chain, qpos: Float[Array, "dof=9 *B"]) -> Float[Array, "3 3 7 *B"]:
     """Rotation of each hinge since the reference configuration, [3, 3, 7, ...] (Rodrigues' formula).
 
     Matrices, not quaternions: in float32 the site's position is then off by 4e-8 m instead of 6e-8 (root mean square).
     """
     angle = (qpos - chain.reference)[:NUM_JOINTS]
-    along = chain.axis[:, None] * chain.axis
+    along = chain.axis[:, None] * chain.axis[None]
     columns = jnp.eye(3, dtype=along.dtype).reshape(3, 3, *[1] * angle.ndim)
-    return along + jnp.cos(angle) * (columns - along) + jnp.sin(angle) * cross(chain.axis[:, None], columns)
+    cos, sin = jnp.cos(angle)[None, None], jnp.sin(angle)[None, None]
+    return along + cos * (columns - along) + sin * cross(chain.axis[:, None], columns)
 
 
 def _compose(mat: Float[Array, "3 3 7 *B"], *, reach: int) -> Float[Array, "3 3 7 *B"]:
@@ -211,26 +212,26 @@ def _compose(mat: Float[Array, "3 3 7 *B"], *, reach: int) -> Float[Array, "3 3 
     return jnp.concatenate([mat[:, :, :reach], _product(mat[:, :, :-reach], mat[:, :, reach:])], axis=2)
 
 
-def _hinge_quats(chain: Chain, qpos: Float[Array, 9 * B]) -> Float[Array, "4 7 *B"]:
+def _hinge_quats(chain: Chain, qpos: Float[Array, "dof=9 *B"]) -> Float[Array, "4 7 *B"]:
     """The same as quaternions, [4, 7, ...]."""
     half = 0.5 * (qpos - chain.reference)[:NUM_JOINTS]
-    return jnp.concatenate([jnp.cos(half)[None], chain.axis * jnp.sin(half)])
+    return jnp.concatenate([jnp.cos(half)[None], chain.axis * jnp.sin(half)[None]])
 
 
 def _quat_product(a: Float[Array, "4 *#B"], b: Float[Array, "4 *#B"]) -> Float[Array, "4 *#B"]:
     """Hamilton product of quaternions [4, ...]."""
     scalar = a[0] * b[0] - sum_rows(a[1:] * b[1:])
-    return jnp.concatenate([scalar[None], a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:])])
+    return jnp.concatenate([scalar[None], a[:1] * b[1:] + b[:1] * a[1:] + cross(a[1:], b[1:])])
 
 
 def _rotate(mat: Float[Array, "3 3 *#B"], v: Float[Array, "3 *#B"]) -> Float[Array, "3 *#B"]:
     """Matrices [3, 3, ...] times vectors [3, ...]."""
-    return mat[:, 0] * v[0] + mat[:, 1] * v[1] + mat[:, 2] * v[2]
+    return mat[:, 0] * v[:1] + mat[:, 1] * v[1:2] + mat[:, 2] * v[2:]
 
 
 def _product(a: Float[Array, "3 3 *#B"], b: Float[Array, "3 3 *#B"]) -> Float[Array, "3 3 *#B"]:
     """Matrices [3, 3, ...] times matrices [3, 3, ...]."""
-    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
+    return a[:, :1] * b[:1] + a[:, 1:2] * b[1:2] + a[:, 2:] * b[2:]
 
 
 def _place(chain: Chain, mat: Float[Array, "3 3 7 *B"]) -> _Frames:
@@ -258,14 +259,14 @@ def _site(chain: Chain, frames: _Frames) -> tuple[jax.Array, jax.Array, jax.Arra
     return chain.base + frames.eef, mat, jacobian, jnp.concatenate([axis, cross(frames.pos, axis)])
 
 
-def _inertias(chain: Chain, frames: _Frames, qpos: Float[Array, 9 * B]) -> _Inertias:
+def _inertias(chain: Chain, frames: _Frames, qpos: Float[Array, "dof=9 *B"]) -> _Inertias:
     """Inertias of the nine bodies."""
     mat, origin = jnp.stack([_with_fingers(row) for row in frames.mat]), _with_fingers(frames.pos)
-    slid = chain.slide * (qpos - chain.reference)[NUM_JOINTS:]
+    slid = chain.slide * (qpos - chain.reference)[None, NUM_JOINTS:]
     own = jnp.concatenate([jnp.zeros_like(frames.pos), slid], axis=1) + chain.com
     com = origin + _rotate(mat, own)
     turned = _product(_product(mat, chain.inertia), jnp.swapaxes(mat, 0, 1))
-    first = chain.mass * com
+    first = chain.mass[None] * com
     return _Inertias(chain.mass, first, turned + _point_moments(first, com))
 
 
@@ -274,7 +275,7 @@ def _with_fingers(x: Float[Array, "c 7 *B"]) -> Float[Array, "c 9 *B"]:
     return jnp.concatenate([x, x[:, -1:], x[:, -1:]], axis=1)
 
 
-def _point_moments(first: Float[Array, 3 * B], com: Float[Array, 3 * B]) -> Float[Array, "3 3 *B"]:
+def _point_moments(first: Float[Array, "xyz=3 *B"], com: Float[Array, "xyz=3 *B"]) -> Float[Array, "3 3 *B"]:
     """Second moments [3, 3, ...] of point masses at ``com`` [3, ...]; ``first`` is mass times ``com``."""
     across = first[:, None] * com[None]
     trace = across[0, 0] + across[1, 1] + across[2, 2]
@@ -286,7 +287,7 @@ def _momentum(inertias: _Inertias, twist: Float[Array, "6 k *B"]) -> Float[Array
     """Spatial inertias times twists, [6, k, ...]."""
     turn, move = twist[:3], twist[3:]
     moment = _rotate(inertias.second, turn) + cross(inertias.first, move)
-    return jnp.concatenate([moment, inertias.mass * move - cross(inertias.first, turn)])
+    return jnp.concatenate([moment, inertias.mass[None] * move - cross(inertias.first, turn)])
 
 
 def _mass_matrix(chain: Chain, screws: Float[Array, "6 7 *B"], inertias: _Inertias) -> Float[Array, "7 7 *B"]:
@@ -298,7 +299,7 @@ def _mass_matrix(chain: Chain, screws: Float[Array, "6 7 *B"], inertias: _Inerti
     row, column = np.indices((NUM_JOINTS, NUM_JOINTS)).reshape(2, NUM_JOINTS, NUM_JOINTS, *[1] * (product.ndim - 2))
     # Of two joints, the outer one's composite inertia counts.
     symmetric = jnp.where(row <= column, product, jnp.swapaxes(product, 0, 1))
-    return symmetric + jnp.where(row == column, chain.armature, 0)
+    return symmetric + jnp.where(row == column, chain.armature[None], 0)
 
 
 def _backward_sum(x: Float[Array, "c 9 *B"]) -> Float[Array, "c 7 *B"]:
@@ -307,12 +308,12 @@ def _backward_sum(x: Float[Array, "c 9 *B"]) -> Float[Array, "c 7 *B"]:
 
 
 def _twists(
-    chain: Chain, frames: _Frames, screws: Float[Array, "6 7 *B"], qvel: Float[Array, 9 * B]
+    chain: Chain, frames: _Frames, screws: Float[Array, "6 7 *B"], qvel: Float[Array, "dof=9 *B"]
 ) -> tuple[Float[Array, "6 9 *B"], Float[Array, "6 9 *B"]]:
     """Twists of the nine bodies, and what each body's own joint adds to them, [6, 9, ...]."""
-    slide = _rotate(frames.mat[:, :, -1:], chain.slide) * qvel[NUM_JOINTS:]
+    slide = _rotate(frames.mat[:, :, -1:], chain.slide) * qvel[None, NUM_JOINTS:]
     fingers = jnp.concatenate([jnp.zeros_like(slide), slide])
-    added = jnp.concatenate([screws * qvel[:NUM_JOINTS], fingers], axis=1)
+    added = jnp.concatenate([screws * qvel[None, :NUM_JOINTS], fingers], axis=1)
     return _accumulate(added), added
 
 
@@ -337,6 +338,6 @@ def _forces(
     return _momentum(inertias, lifted) + gyroscopic
 
 
-def _project(screws: Float[Array, "6 7 *B"], force: Float[Array, "6 9 *B"]) -> Float[Array, 7 * B]:
+def _project(screws: Float[Array, "6 7 *B"], force: Float[Array, "6 9 *B"]) -> Float[Array, "dof=7 *B"]:
     """Torques of the hinges, [7, ...]: each carries the forces on everything behind it."""
     return sum_rows(screws * _backward_sum(force))

@@ -240,7 +240,7 @@ def _torques_last(
 def _desired(arm: ArmState, goal: OscGoal, home: jax.Array, *, config: OscConfig) -> tuple[jax.Array, ...]:
     """Desired linear [3, N], angular [3, N] and joint [7, N] accelerations: springs and dampers."""
     kd = 2 * math.sqrt(config.kp) * config.damping_ratio
-    velocity = sum_rows(jnp.moveaxis(arm.jacobian * arm.qvel, 1, 0))
+    velocity = sum_rows(jnp.moveaxis(arm.jacobian * arm.qvel[None], 1, 0))
     turn = sum(cross(arm.eef_mat[:, i], goal.mat[:, i]) for i in range(3))
     force = config.kp * (goal.pos - arm.eef_pos) - kd * velocity[:3]
     moment = 0.5 * config.kp * turn - kd * velocity[3:]
@@ -259,7 +259,7 @@ def _table(
 def _eliminate_row(rest: Float[Array, "k m N"]) -> Float[Array, "k-1 m-1 N"]:
     """One step of Gaussian elimination without pivoting (M is positive definite): [k, m, N] -> [k - 1, m - 1, N]."""
     pivot = rest[0, 1:]
-    return rest[1:, 1:] - (pivot[: rest.shape[0] - 1] / rest[0, 0])[:, None] * pivot
+    return rest[1:, 1:] - (pivot[: rest.shape[0] - 1] / rest[0, :1])[:, None] * pivot[None]
 
 
 def _scale_rows(tables: list[jax.Array]) -> tuple[Float[Array, "7 7 N"], Float[Array, "7 7 N"]]:
@@ -319,12 +319,12 @@ def _project(
     squared = sum_rows(pivot * pivot)
     kept = squared > floor[index]
     inverse = jnp.where(kept, 1 / jnp.where(kept, squared, 1), 0)
-    return inverse, sum_rows(pivot[:, None] * block[:7, 1:]) * inverse
+    return inverse, sum_rows(pivot[:, None] * block[:7, 1:]) * inverse[None]
 
 
 def _remove(block: Float[Array, "8 k N"], ratio: Float[Array, "k-1 N"]) -> Float[Array, "8 k-1 N"]:
     """The other columns less their component along the first, [8, k - 1, N]."""
-    return block[:, 1:] - block[:, :1] * ratio
+    return block[:, 1:] - block[:, :1] * ratio[None]
 
 
 def _components(basis: list[_Direction], rest: Float[Array, "8 1 N"]) -> list[Float[Array, " N"]]:
@@ -338,7 +338,7 @@ def _remove_all(
     """The last column less these components, [7, N]."""
     vector = rest[:7, 0]
     for along, component in zip(basis, components, strict=True):
-        vector = vector - along.block[:7, 0] * component
+        vector = vector - along.block[:7, 0] * component[None]
     return vector
 
 
@@ -367,7 +367,7 @@ def _add_solutions(
 ) -> Float[Array, "7 N"]:
     """Whitened torque [7, N]: the shortest solutions of both systems plus the posture's free part."""
     for along, component in zip(basis, components, strict=True):
-        free = free + along.block[:7, 0] * component
+        free = free + along.block[:7, 0] * component[None]
     return free
 
 

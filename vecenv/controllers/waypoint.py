@@ -159,8 +159,9 @@ def _advance(reference: Pose, target: Pose, config: WaypointConfig) -> Pose:
     return Pose(reference.pos + step, _turn(reference.quat, turn))
 
 
-def _bounded(vector: Float[Array, "*B 3"], length: float) -> Float[Array, "*B 3"]:
+def _bounded(vector: Float[AnyArray, "*B 3"], length: float) -> Float[Array, "*B 3"]:
     """Vectors [..., 3] shortened to at most ``length``."""
+    vector = jnp.asarray(vector)
     norm = safe_norm(vector)[..., None]
     return vector * jnp.where(norm > length, length / jnp.where(norm > length, norm, 1), 1)
 
@@ -268,7 +269,7 @@ def plan_advance(
     left = (arrived & driving) | (spent >= jnp.where(driving, config.max_steps, hold))
     missed = left & driving & ~arrived
     misses = jnp.where(left & driving, jnp.where(missed, progress.misses + 1, 0), progress.misses)
-    here = jnp.arange(plan.valid.shape[1]) == progress.index[:, None]
+    here = jnp.arange(plan.valid.shape[1])[None] == progress.index[:, None]
     after = Progress(
         index=_next_valid(plan.valid, progress.index + left),
         spent=jnp.where(left, 0, spent),
@@ -289,5 +290,5 @@ def _at_index(plan: WaypointPlan, index: Int[Array, " B"]) -> tuple[Pose, Real[A
 def _next_valid(valid: Bool[AnyArray, "B T"], index: Int[Array, " B"]) -> Int[Array, " B"]:
     """The first valid waypoint at or after ``index``, or T."""
     count = valid.shape[1]
-    ahead = valid & (jnp.arange(count) >= index[:, None])
+    ahead = valid & (jnp.arange(count)[None] >= index[:, None])
     return jnp.where(ahead.any(1), ahead.argmax(1), count).astype(jnp.int32)

@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from vecenv.util.arrays import AnyArray
 
-def require_tail(name: str, array: jax.Array, tail: tuple[int, ...]) -> None:
+
+def require_tail(name: str, array: AnyArray, tail: tuple[int, ...]) -> None:
     """Check the trailing axes of an array.
 
     Args:

@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import numpy.typing as npt
 from jaxtyping import Array, Float, Int
 
 from vecenv.errors import InvalidInput
@@ -31,6 +30,7 @@ from vecenv.libero.scene.scene import Entity, Scene
 from vecenv.libero.tasks import fixtures
 from vecenv.libero.tasks.fixtures import FixturePlacement
 from vecenv.libero.tasks.settled import SettledStarts
+from vecenv.util.arrays import AnyArray
 from vecenv.util.rotations import quat_conjugate, quat_mul, rotate
 
 LAYOUTS = 64
@@ -309,6 +309,6 @@ def _reach(axes: jax.Array, half: jax.Array, along: jax.Array) -> jax.Array:
     return jnp.sum(half * jnp.abs(jnp.sum(axes * along[..., None, :], -1)), -1)
 
 
-def _real(values: npt.ArrayLike) -> jax.Array:
+def _real(values: AnyArray | Sequence[Sequence[float]] | Sequence[float]) -> jax.Array:
     """As floats of JAX's default width."""
     return jnp.asarray(values, jnp.result_type(float))
