@@ -7,7 +7,6 @@ package needs no import of theirs. Nothing heavy is imported before a command ru
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib
 import importlib.metadata
@@ -17,6 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
+
+from vecenv.util.names import unknown
 
 if TYPE_CHECKING:
     from vecenv.protocols import Protocol
@@ -152,12 +153,6 @@ def compile_command(
         fail(str(error), code=1)
     counts = f"suites: {done.suites}, tasks: {done.tasks}, scenes: {done.scenes}"
     typer.echo(f"{counts}, {done.size / 1e6:.0f} MB in {done.folder}")
-
-
-def unknown(what: str, given: str, known: Sequence[str]) -> str:
-    """Say that a name is not known, and which known names come close (all of them when none does)."""
-    close = difflib.get_close_matches(given, known, n=3) or known
-    return f"unknown {what} {given!r}: did you mean {', '.join(close)}?"
 
 
 def _version(wanted: bool) -> None:

@@ -14,7 +14,7 @@ from vecenv import family, protocols
 
 if TYPE_CHECKING:
     from vecenv.contract import BatchEnv
-    from vecenv_eval.runner import EvalConfig
+    from vecenv_eval.config import EvalConfig
 
 # What a family has no choice of.
 NONE = "-"
