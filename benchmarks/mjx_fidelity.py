@@ -243,7 +243,7 @@ def run(env: LiberoEnv, chunk: np.ndarray, limit: np.ndarray) -> Ended:
 
 def play(env: LiberoEnv) -> tuple[np.ndarray, Ended]:
     """Let `pick_place` act until all slots are finished or given up; actions [B, K, 7], rounded to 32 bits."""
-    from vecenv_eval.policies.pick_place import PickPlacePolicy
+    from vecenv_eval.policies.pick_place.policy import PickPlacePolicy
 
     policy = PickPlacePolicy()
     policy.reset(env, env.reset())

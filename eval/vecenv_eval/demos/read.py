@@ -58,7 +58,7 @@ def read_demos(path: Path, *, suite: str | None = None, task: int | None = None)
     with Opened(path) as file, Errors(path):
         data = member(file, "data", h5py.Group)
         spec = _find_task(path, data, suite, task)
-        names = sorted((name for name in data if _NAME.fullmatch(name)), key=_number)
+        names = sorted((name for name in map(str, data) if _NAME.fullmatch(name)), key=_number)
         if not names:
             raise DemoError("its group 'data' holds no demonstrations (demo_0, demo_1, ...)")
         demos, bad = [], []
@@ -128,7 +128,7 @@ def _stored_start(group: h5py.Group, spec: TaskSpec, ticks: int) -> StoredStart:
         name, state = "states row 0", np.asarray(states_dataset(group, ticks)[0], float)
     else:
         raise DemoError("neither the attribute init_state nor states: nothing says where it begins")
-    width = spec.initstates_dataset().shape[1]
+    width = spec.init_states().shape[1]
     if len(state) != width:
         raise DemoError(f"{name}: {len(state)} numbers, but a state of {spec.suite} task {spec.index} has {width}")
     text = text_attribute(group, "model_file")

@@ -18,9 +18,9 @@ from vecenv.contract import BatchEnv, Control, ResetInfo
 from vecenv.errors import InvalidInput
 
 BUILTIN = {
-    "pick_place": "vecenv_eval.policies.pick_place:PickPlacePolicy",
+    "pick_place": "vecenv_eval.policies.pick_place.policy:PickPlacePolicy",
     "random": "vecenv_eval.policies.random:RandomPolicy",
-    "simpler_scripted": "vecenv_eval.policies.simpler_scripted:SimplerScriptedPolicy",
+    "simpler_scripted": "vecenv_eval.policies.simpler.policy:SimplerScriptedPolicy",
     "voxposer": "vecenv_eval.policies.voxposer:VoxPoserPolicy",
     "zero": "vecenv_eval.policies.scripted:ZeroPolicy",
 }

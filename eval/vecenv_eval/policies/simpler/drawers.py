@@ -15,7 +15,7 @@ import numpy as np
 
 from vecenv.contract import Part, PartJoint
 from vecenv.simpler.control.kinematics import rotvec_from_rotation
-from vecenv_eval.policies.simpler_reach import Arm, Waypoint, pose, through
+from vecenv_eval.policies.simpler.reach import Arm, Waypoint, pose, through
 
 # Angles of the closed fingers, radians: below the horizontal, and sideways.
 _HOOK_PITCHES = np.deg2rad([25.0, 30.0, 35.0])

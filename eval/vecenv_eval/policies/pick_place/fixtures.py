@@ -13,7 +13,7 @@ import numpy as np
 
 from vecenv.contract import RegionBox
 from vecenv.manipulation.world import HOME_ROTATION, World, down_facing, spun, yaw
-from vecenv_eval.policies.pick_place_motion import CLOSE, OPEN, Waypoint
+from vecenv_eval.policies.pick_place.motion import CLOSE, OPEN, Waypoint
 
 
 @dataclass(frozen=True, kw_only=True)
