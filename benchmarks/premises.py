@@ -33,7 +33,8 @@ from typing import Any
 
 import numpy as np
 from common import RESULTS, report
-from mjx_fidelity import Worker, by_scene, tasks_of
+from fidelity.scenes import by_scene, tasks_of
+from fidelity.workers import Worker
 
 import vecenv
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv

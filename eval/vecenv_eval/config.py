@@ -11,11 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import vecenv
 from vecenv.errors import InvalidInput
 from vecenv.util.names import unknown
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 ALL = "all"
 # Policies that know a benchmark's scenes, by the family of suites they are made for.
@@ -153,7 +156,7 @@ class EvalConfig:
         try:
             return TypeAdapter(cls).validate_python(dict(values))
         except ValidationError as error:
-            raise ConfigError("; ".join(f"{each['loc'][0]}: {each['msg']}" for each in error.errors())) from None
+            raise ConfigError("; ".join(map(_problem, error.errors()))) from None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by field name, with the policy that is run; :meth:`from_dict` reads them back."""
@@ -177,6 +180,11 @@ class EvalConfig:
         if not isinstance(self.episodes, str):
             values["episodes"] = list(self.episodes)
         path.write_text(yaml.safe_dump(values, sort_keys=False))
+
+
+def _problem(error: ErrorDetails) -> str:
+    """What pydantic found wrong with one field, or what the config itself raised."""
+    return f"{error['loc'][0]}: {error['msg']}" if error["loc"] else str(error.get("ctx", {})["error"])
 
 
 def read_settings(path: Path) -> dict[str, Any]:

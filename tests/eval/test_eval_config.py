@@ -65,7 +65,7 @@ def test_yaml_needs_only_what_differs_and_numbers_may_stand_for_text(tmp_path: P
     [
         ("suite: s\nmax_step: 3", "unknown setting 'max_step': did you mean max_steps"),
         ("suite: s\nmax_steps: many", "max_steps: .*integer"),
-        ("suite: s\npolicy_args: [1]", "policy_args: .*mapping"),
+        ("suite: s\npolicy_args: [1]", "policy_args: .*dictionary"),
         ("suite: s\nnum_envs: 0", "num_envs must be at least 1, not 0"),
         ("tasks: all", "suite: .*required"),
         ("- suite", "expected settings such as"),

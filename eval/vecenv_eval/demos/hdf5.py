@@ -105,7 +105,7 @@ def numeric_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
     """A numeric dataset that lies in the file itself and can be read in pieces of a reasonable size."""
     dataset = member(group, name, h5py.Dataset)
     if dataset.external or dataset.is_virtual:
-        raise DemoError(f"{name}: its data is in another file")
+        raise DemoError(f"{name}: its numbers are in another file")
     if dataset.dtype.kind not in "fiub":
         raise DemoError(f"{name}: expected numbers, got {dataset.dtype}")
     if math.prod(dataset.chunks or ()) * dataset.dtype.itemsize > _MAX_CHUNK_BYTES:
