@@ -3,12 +3,12 @@
 Three stages, so that the GPU machine needs no LIBERO packages and no native physics. ``record`` runs `pick_place` on
 the native backend with upstream's geometry and writes one file a suite: starts, what moves in 50 idle ticks, actions,
 verdicts, where objects end. ``compare`` gives every backend and geometry the same starts and actions: one batch a
-scene, in which every episode is there once idle and twice replayed (the second tells how far MJX repeats itself).
-``table`` puts what ``compare`` wrote into Markdown. The backend ``nudged`` is the yardstick: native once more, every
-action moved by what single precision rounds away; what that changes, no float32 backend can be asked to keep.
+scene, in which every episode is once idle and twice replayed (the second shows how far MJX repeats itself).
+``table`` turns the results of ``compare`` into Markdown. The backend ``nudged`` is the yardstick: native once more,
+every action moved by the rounding error of single precision; no float32 backend can be expected to differ by less.
 
-Scenes are compiled and run by worker processes; a scene that fails or hangs is reported and the others go on. Results
-are written after every scene, and a second run does what is missing.
+Scenes are compiled and run by worker processes; a scene that fails or hangs is reported and the others continue.
+Results are written after every scene, and a second run does what is missing.
 
     python benchmarks/mjx_fidelity.py record --out recordings
     vecenv compile --out scenes --suite libero_object ... --geometry exact --geometry lean

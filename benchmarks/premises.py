@@ -1,9 +1,9 @@
-"""Whether every start is what its task file says: the premises of all suites' starts, on every backend.
+"""Whether every start is as its task file describes it: the premises of all suites' starts, on every backend.
 
 For each settled start: every ``:init`` predicate of the BDDL about objects and joints holds, the goal is not yet true,
 and nothing has moved by more than 5 mm after 50 further idle ticks. A row is a suite on a backend, with the number of
 starts that miss each premise; the file lists them by task, predicate or object, and episode. With ``--start stored``
-the predicates are asked of the init states exactly as LIBERO stores them, which says what it missed from the beginning.
+the predicates are asked of the init states exactly as LIBERO stores them, which shows what they miss.
 
 Two stages: ``--observe`` runs the backend, scene by scene in worker processes, and writes a file a scene with what it
 saw; with ``--scenes`` it needs no LIBERO packages, so it can be done on a GPU machine. ``--judge`` asks the predicates

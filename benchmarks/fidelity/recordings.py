@@ -29,8 +29,8 @@ class Recording:
         success: whether it ended solved, bool [N].
         actions: the actions of all episodes, one episode after the other, float32 [sum of lengths, 7].
         start: positions at the start, [N, M, 3], NaN past a scene's last object.
-        settled: after 50 idle ticks from the start, likewise.
-        end: at the end of the episode, likewise.
+        settled: after 50 idle ticks from the start, [N, M, 3].
+        end: at the end of the episode, [N, M, 3].
         notes: how it was recorded.
     """
 

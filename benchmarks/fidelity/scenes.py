@@ -74,7 +74,7 @@ class Ended(NamedTuple):
 
 
 def ended(env: LiberoEnv, ticks: np.ndarray, success: np.ndarray) -> Ended:
-    """What the batch is like now. Positions of objects are read off qpos, so nothing has to be computed anew."""
+    """The state of the batch now. Positions of objects are read from qpos, so no kinematics is needed."""
     (group,) = env.physics.groups
     qpos = np.array(group.qpos)
     return Ended(qpos, qpos[:, object_columns(group.scene)], ticks, success, dict(env.physics.faults))

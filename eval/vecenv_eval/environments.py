@@ -1,4 +1,4 @@
-"""The environment that runs the batches: built once, placed anew while scenes stay the same, closed at the end.
+"""The environment that runs the batches: built once, re-placed while scenes stay the same, closed at the end.
 
 A :class:`~vecenv_eval.episodes.Batch` comes in; :class:`Placed` goes out: the batch after its reset, and the episode in
 each slot.

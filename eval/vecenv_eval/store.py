@@ -49,7 +49,7 @@ class Record:
         batch: which batch of that run.
         setup_s: seconds it took to place the batch (building or re-placing the environment, and reset).
         wall_s: seconds from then until this episode ended, the policy's included.
-        extras: what the policy has to say about the episode, numbers and words by name.
+        extras: what the policy reports about the episode, numbers and texts by name.
         stand_ins: a sentence for each file that was missing and what was used instead.
     """
 

@@ -94,7 +94,7 @@ def _user_errors() -> Iterator[None]:
 
 
 def _run(evaluation: Evaluation, store: ResultStore, quiet: bool) -> int:
-    """Run, print, and say how the process should exit."""
+    """Run and print; returns the exit status."""
     from rich.console import Console
 
     console = Console(quiet=quiet)

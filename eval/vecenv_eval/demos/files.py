@@ -12,7 +12,7 @@ from vecenv_eval.demos.schema import SUFFIXES, Demo
 
 
 class ReplayError(InvalidInput):
-    """There is nothing to replay; the message says what was looked for."""
+    """There is nothing to replay; the message names what was searched."""
 
 
 def find_files(paths: Iterable[Path]) -> list[Path]:

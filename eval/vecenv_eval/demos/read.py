@@ -47,7 +47,7 @@ def read_demos(path: Path, *, suite: str | None = None, task: int | None = None)
 
     Args:
         path: the file.
-        suite, task: what it demonstrates; by default what the file says, or the task whose name it bears.
+        suite, task: what it demonstrates; by default what the file states, or the task of the same name.
 
     Returns:
         The demonstrations in order of their numbers, and those that cannot be used.
@@ -145,7 +145,7 @@ def _made_start(group: h5py.Group) -> MadeStart:
 
 
 def _find_task(path: Path, data: h5py.Group, suite: str | None, task: int | None) -> TaskSpec:
-    """The task asked for; else the one the file names; else the one whose task file or file name it bears."""
+    """The task asked for; else the one the file names; else the one named as its task file or the file is."""
     if suite is None and task is None and "suite" in data.attrs:
         return _named_task(text_attribute(data, "suite"), data.attrs.get("task"))
     if suite is not None and task is not None:

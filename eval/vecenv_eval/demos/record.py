@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.contract import BatchEnv, State
 from vecenv.errors import InvalidFile
@@ -104,6 +105,6 @@ def _of_slot(options: Mapping[str, Any], slot: int) -> dict[str, Any]:
     return {**options, "fixtures": own}
 
 
-def _row(values: Any, slot: int) -> list[float]:
+def _row(values: npt.ArrayLike, slot: int) -> list[float]:
     array = np.asarray(values, float)
     return (array if array.ndim == 1 else array[slot]).tolist()

@@ -17,6 +17,7 @@ import numpy as np
 import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.contract import ACTION_DIM, Control
+from vecenv.libero.env import LiberoEnv
 from vecenv_eval.demos.hdf5 import DemoError, Unreadable
 from vecenv_eval.demos.outcomes import Outcome, ReplayReport
 from vecenv_eval.demos.record import flat_state
@@ -53,7 +54,7 @@ def replay(
     Args:
         demos: what to replay.
         config: how.
-        on_batch: told in a line what each batch is, before it runs.
+        on_batch: called with one line about each batch, before it runs.
 
     Returns:
         Outcomes in the order of ``demos``. What the simulator refuses to place is a problem of that batch alone.
@@ -97,7 +98,7 @@ def _start_key(start: StoredStart | MadeStart) -> Hashable:
     return None if start.fixtures is None else frozenset(start.fixtures)
 
 
-def _make(demos: Sequence[Demo], config: ReplayConfig) -> Any:
+def _make(demos: Sequence[Demo], config: ReplayConfig) -> LiberoEnv:
     """The environment with one slot a demonstration, reset and in the start states."""
     stored = [demo.start for demo in demos if isinstance(demo.start, StoredStart)]
     made = [demo.start for demo in demos if isinstance(demo.start, MadeStart)]  # one list is empty: see _start_key
@@ -109,7 +110,8 @@ def _make(demos: Sequence[Demo], config: ReplayConfig) -> Any:
     for name in ("backend", "contacts"):
         if getattr(config, name) is not None:
             options[name] = getattr(config, name)
-    env: Any = vecenv.make(demos[0].suite, tasks=list(episodes), episodes=episodes, **options)
+    env = vecenv.make(demos[0].suite, tasks=list(episodes), episodes=episodes, **options)
+    assert isinstance(env, LiberoEnv)  # demonstrations are of LIBERO's suites
     try:
         env.reset()
         if stored:
@@ -131,7 +133,7 @@ def _stored_options(starts: Sequence[StoredStart]) -> dict[str, Any]:
     return options
 
 
-def _load(env: Any, starts: Sequence[StoredStart]) -> None:
+def _load(env: LiberoEnv, starts: Sequence[StoredStart]) -> None:
     """Put each slot into its stored state; the controller keeps its memory of the reset, as upstream's does."""
     state = env.state()
     qpos, qvel, time = state.qpos.copy(), state.qvel.copy(), state.time.copy()
@@ -152,8 +154,8 @@ def _replay_batch(demos: Sequence[Demo], config: ReplayConfig) -> list[Outcome]:
         env.close()
 
 
-def _step_through(env: Any, demos: Sequence[Demo]) -> list[Outcome]:
-    """Step until every demonstration has been judged; one that is through idles beside the others."""
+def _step_through(env: LiberoEnv, demos: Sequence[Demo]) -> list[Outcome]:
+    """Step until every demonstration has been judged; one that has ended idles beside the others."""
     lengths = np.array([len(demo) for demo in demos])
     outcomes: list[Outcome | None] = [None] * len(demos)
     nq = env.state().nq
@@ -170,7 +172,7 @@ def _step_through(env: Any, demos: Sequence[Demo]) -> list[Outcome]:
     return [outcome for outcome in outcomes if outcome is not None]
 
 
-def _states(env: Any, chosen: np.ndarray) -> dict[int, np.ndarray]:
+def _states(env: LiberoEnv, chosen: np.ndarray) -> dict[int, np.ndarray]:
     if not chosen.any():
         return {}
     state = env.state()
@@ -189,7 +191,7 @@ def _actions(demos: Sequence[Demo], tick: int) -> np.ndarray:
 
 
 def _outcome(demo: Demo, control: Control, slot: int, nq: int, before: np.ndarray | None, after: np.ndarray) -> Outcome:
-    """What became of a slot that has just been judged, with its states before and after its last action."""
+    """The outcome of a slot that has just been judged, with its states before and after its last action."""
     ticks = int(control.step_index[slot])
     notes = [NO_FIXTURES] if isinstance(demo.start, StoredStart) and demo.start.fixtures is None else []
     try:

@@ -35,7 +35,7 @@ _ENTRY, _SAGS = (1.0, 0.3), 0.02
 _LEAVE = 0.06
 # Fingers may slip this far before they take the drawer along, metres.
 _SLACK = 0.06
-# Pushing begins so far before the front, and goes on so far beyond closed.
+# Pushing begins this far before the front, and ends this far beyond closed.
 _AWAY, _BEYOND = 0.06, 0.01
 # Sideways angles and places off the middle cost as much as this much room at the joints' limits, radians.
 _PREFER_STRAIGHT, _PREFER_MIDDLE = 1.0, 0.2

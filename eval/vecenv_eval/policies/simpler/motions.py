@@ -1,7 +1,7 @@
 """How each family of SIMPLER's tasks is solved with ground truth: scripts that yield waypoints and get a new look.
 
 A script is a generator: it yields a list of ``Waypoint`` for its own slot, and is sent a ``Look`` at what came of it.
-It ends when it has done what it can; the policy begins it anew while the task is not solved. Geometry comes from the
+It ends when it has done what it can; the policy starts it again while the task is not solved. Geometry comes from the
 look alone; constants here are of the gripper or of a family, never of an episode.
 """
 

@@ -33,7 +33,7 @@ class SimplerScriptedPolicy:
     """Ground-truth policy for all 25 tasks of SIMPLER.
 
     Args:
-        attempts: how often a slot may begin anew before it stays where it is.
+        attempts: how often a slot may start again before it stays where it is.
 
     Attributes:
         name: how the policy is called in results.
