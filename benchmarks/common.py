@@ -7,7 +7,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -15,7 +14,9 @@ RESULTS = Path(__file__).resolve().parent / "results"
 sys.path.insert(0, str(ROOT / "tests"))
 
 
-def report(name: str, rows: Sequence[Mapping[str, Any]], *, title: str, notes: Mapping[str, Any] | None = None) -> Path:
+def report(
+    name: str, rows: Sequence[Mapping[str, object]], *, title: str, notes: Mapping[str, object] | None = None
+) -> Path:
     """Print rows as a table and write them, with the machine and the versions, to ``results/{name}.json``."""
     from rich.console import Console
     from rich.table import Table
@@ -44,7 +45,7 @@ def report(name: str, rows: Sequence[Mapping[str, Any]], *, title: str, notes: M
     return path
 
 
-def show(value: Any) -> str:
+def show(value: object) -> str:
     """A cell: small floats in scientific notation, others with three significant digits."""
     if isinstance(value, float):
         return f"{value:.1e}" if value and abs(value) < 1e-2 else f"{value:.3g}"

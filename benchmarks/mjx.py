@@ -15,7 +15,7 @@ import itertools
 import statistics
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -34,7 +34,7 @@ from vecenv.libero.physics.mjx.step import World, control_step
 from vecenv.libero.scene.contacts import CONTACTS
 
 CHUNK = 10
-# How XLA, CUDA and Warp say it.
+# Messages of XLA, CUDA and Warp.
 OUT_OF_MEMORY = ("resource_exhausted", "out of memory", "failed to allocate")
 
 
@@ -161,12 +161,12 @@ def there_and_back(group: MjxGroup) -> jax.Array:
     return group.put(np.concatenate([held, -held], axis=1))
 
 
-def environment(group: MjxGroup, start: World | None = None) -> Callable[[], Any]:
-    """Run a chunk, each time from ``start``; without it the state goes on from call to call."""
+def environment(group: MjxGroup, start: World | None = None) -> Callable[[], jax.Array]:
+    """Run a chunk, each time from ``start``; without it each call continues from the last."""
     n = len(group.slots)
     chunk, active, limit = there_and_back(group), group.put_mask(np.ones(n, bool)), group.put(np.full(n, 10**6))
 
-    def run() -> Any:
+    def run() -> jax.Array:
         assert group.table is not None
         worlds = group.worlds if start is None else jax.tree.map(jnp.copy, start)
         loop = group.compiled.run(True)(group.system, group.table, worlds, chunk, active, limit)
@@ -176,7 +176,7 @@ def environment(group: MjxGroup, start: World | None = None) -> Callable[[], Any
     return run
 
 
-def bare(group: MjxGroup, start: World) -> Callable[[], Any]:
+def bare(group: MjxGroup, start: World) -> Callable[[], jax.Array]:
     """Step the physics alone through the ticks of the same chunk."""
     act = jax.vmap(control_step, in_axes=(None, 0, 0))
     step = jax.vmap(mjx.step, in_axes=(None, 0))
@@ -195,7 +195,7 @@ def bare(group: MjxGroup, start: World) -> Callable[[], Any]:
     return lambda: many(start.data, ticks)
 
 
-def timed_first(run: Callable[[], Any]) -> tuple[Callable[[], Any], float]:
+def timed_first(run: Callable[[], jax.Array]) -> tuple[Callable[[], jax.Array], float]:
     """The function, and the seconds its first call takes beyond its second."""
     seconds = []
     for _ in range(2):
@@ -205,7 +205,7 @@ def timed_first(run: Callable[[], Any]) -> tuple[Callable[[], Any], float]:
     return run, max(seconds[0] - seconds[1], 0.0)
 
 
-def alternate(runs: list[Callable[[], Any] | None], rounds: int, seconds: float) -> list[float]:
+def alternate(runs: Sequence[Callable[[], object] | None], rounds: int, seconds: float) -> list[float]:
     """Calls a second of each, the median over the rounds."""
     found: list[list[float]] = [[] for _ in runs]
     for _ in range(rounds):
@@ -215,7 +215,7 @@ def alternate(runs: list[Callable[[], Any] | None], rounds: int, seconds: float)
     return [statistics.median(rates) if rates else 0.0 for rates in found]
 
 
-def rate(run: Callable[[], Any], seconds: float) -> float:
+def rate(run: Callable[[], object], seconds: float) -> float:
     """Calls a second over at least so many seconds."""
     start, calls, elapsed = time.perf_counter(), 0, 0.0
     while elapsed < seconds:
@@ -225,7 +225,7 @@ def rate(run: Callable[[], Any], seconds: float) -> float:
 
 
 def used_memory() -> float:
-    """MiB in use on the first device; 0 where nobody says."""
+    """MiB in use on the first device; 0 where it is not known."""
     if jax.devices()[0].platform == "cpu":
         return 0.0
     query = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits"]

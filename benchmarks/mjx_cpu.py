@@ -17,10 +17,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from common import report
+
+if TYPE_CHECKING:
+    from vecenv.libero.env import LiberoEnv
 
 TICKS = 4
 PART = "--part"
@@ -100,8 +103,8 @@ def speed(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def processor_seconds(run: Callable[[], Any]) -> float:
-    """Seconds of all cores that a call takes, which others who compute at the same time change little."""
+def processor_seconds(run: Callable[[], object]) -> float:
+    """Seconds of all cores that a call takes, which other load on the machine changes little."""
     began = time.process_time()
     run()
     run()
@@ -109,7 +112,7 @@ def processor_seconds(run: Callable[[], Any]) -> float:
 
 
 def chunk_runner(scene: str, backend: str, batch: int) -> Callable[[], np.ndarray]:
-    """A function that gives every slot some random actions and then their opposites; the state goes on."""
+    """A function that gives every slot some random actions and then their opposites, from where the last call ended."""
     env = ready_env(scene, backend, batch)
     there = np.random.default_rng(0).uniform(-1, 1, (batch, 1, 7))
     chunk = np.concatenate([np.repeat(there, TICKS // 2, axis=1), np.repeat(-there, TICKS // 2, axis=1)], axis=1)
@@ -124,13 +127,15 @@ def chunk_runner(scene: str, backend: str, batch: int) -> Callable[[], np.ndarra
     return run
 
 
-def ready_env(scene: str, backend: str, batch: int) -> Any:
+def ready_env(scene: str, backend: str, batch: int) -> LiberoEnv:
     """A live batch with lean geometry."""
     import vecenv
+    from vecenv.libero.env import LiberoEnv
 
     suite, task = scene.rsplit("/", 1)
     episodes = [i % 50 for i in range(batch)]
     env = vecenv.make(suite, task=int(task), episodes=episodes, backend=backend, geometry="lean")
+    assert isinstance(env, LiberoEnv)
     env.reset()
     return env
 

@@ -16,9 +16,12 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
 
 ROOT = Path(__file__).resolve().parent.parent
 TICKS = 60
@@ -154,7 +157,7 @@ def python_of(options: argparse.Namespace) -> str:
     """The peer's Python as chosen on the command line.
 
     Raises:
-        SystemExit: it is not there; says how to make it.
+        SystemExit: it is not there; the message has the command that makes it.
     """
     default = ROOT / ".venv-upstream" / "bin" / "python" if options.contacts == "published" else sys.executable
     chosen = Path(options.peer or default)
@@ -167,7 +170,7 @@ def python_of(options: argparse.Namespace) -> str:
 # In the peer's process.
 
 
-def robot_touches(model: Any, data: Any) -> bool:
+def robot_touches(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
     """Whether a geom of the robot's moving parts touches anything that is not the robot."""
     names = [model.body(model.geom_bodyid[g]).name for g in range(model.ngeom)]
     robot = np.array([name.startswith(("robot0", "gripper0")) for name in names])

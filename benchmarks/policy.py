@@ -7,7 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from common import report
-from vecenv_eval.runner import EvalConfig, begin, evaluate
+from vecenv_eval.config import EvalConfig
+from vecenv_eval.results import begin
+from vecenv_eval.runner import evaluate
 
 from vecenv.libero.tasks.suites import BASE_SUITES
 

@@ -1,4 +1,4 @@
-"""Whether every start is what its task file says: the premises of all suites' starts, on every backend.
+"""Whether every start is as its task file describes it: the premises of all suites' starts, on every backend.
 
 For each settled start: every ``:init`` predicate of the BDDL about objects and joints holds, the goal is not yet true,
 and nothing has moved by more than 5 mm after 50 further idle ticks. A row is a suite on a backend, with the number of
@@ -35,7 +35,8 @@ from typing import Any
 
 import numpy as np
 from common import RESULTS, report
-from mjx_fidelity import Worker, by_scene, tasks_of
+from fidelity.scenes import by_scene, tasks_of
+from fidelity.workers import Worker
 
 import vecenv
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv

@@ -1,8 +1,8 @@
 """How long until the first step: processes that start cold, from the cache, or from an exported folder.
 
 Each row of the first kind is a fresh process that imports vecenv, makes a batch of one task of ``libero_spatial``,
-resets it and takes one control step; its caches are what the row says. The compiled JAX functions are the bulk of it,
-so they are shown with JAX's own persistent cache as well. ``cpu`` is the whole process's, which says what a machine
+resets it and takes one control step; the row names its caches. The compiled JAX functions are the bulk of it,
+so they are shown with JAX's own persistent cache as well. ``cpu`` is the whole process's, which shows what a machine
 that is shared would do alone. Then, within one process: going to another scene with
 ``set_episodes``, up to and including its first step; and compiling the 32 scenes of LIBERO's own suites, without the
 cache, into it, and out of it. Seconds; the median of the repetitions, and the slowest.

@@ -4,7 +4,7 @@ Published contacts are held against upstream under MuJoCo 3.3.0 (`make upstream`
 the installed MuJoCo; both sides begin at the stored start, without settling in advance. Actions are piecewise constant
 at random, some without rotation, with gripper flips. A row is a task: the largest difference of joint positions before
 the robot's first contact with anything and after it, of the 8-D proprioception, and whether all verdicts agreed. Where
-contact amplifies differences beyond 1e-3, two last columns say how far upstream diverges from itself when one joint
+contact amplifies differences beyond 1e-3, two columns show how far upstream diverges from itself when one joint
 starts 1e-15 rad away (the largest of seven tries), and when every action that is not zero is 1e-15 larger.
 
     make upstream && python benchmarks/trajectories.py

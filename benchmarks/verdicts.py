@@ -64,7 +64,7 @@ def rollout_states(spec: TaskSpec, kind: str, contacts: Contacts) -> list[np.nda
 
 
 def compare(spec: TaskSpec, contacts: Contacts, python: str) -> tuple[Counter[str], int, int]:
-    """How many states of each kind, on how many both say yes, and on how many they differ."""
+    """How many states of each kind, on how many both find the goal true, and on how many they differ."""
     from support.goal_states import GoalStates, Simulation
 
     from vecenv.libero.tasks import settled

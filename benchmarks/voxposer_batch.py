@@ -13,7 +13,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from common import report
-from vecenv_eval.runner import EvalConfig, EvalResult, begin, evaluate
+from vecenv_eval.config import EvalConfig
+from vecenv_eval.results import EvalResult, begin
+from vecenv_eval.runner import evaluate
 
 
 def main() -> None:

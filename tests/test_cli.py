@@ -16,12 +16,13 @@ from rich.console import Console
 from support.fakes import SUITE, FakeWorld
 from typer.testing import CliRunner, Result
 from vecenv_eval import runner
-from vecenv_eval.cli import _progress
-from vecenv_eval.runner import Progress
+from vecenv_eval.cli.eval import _progress
+from vecenv_eval.results import Progress
 
 from vecenv import doctor
-from vecenv.cli import build_app, unknown
+from vecenv.cli import build_app
 from vecenv.doctor import Check, Report
+from vecenv.util.names import unknown
 
 
 def invoke(*arguments: str, plugins: list[Any] | None = None) -> Result:

@@ -7,8 +7,9 @@ import json
 from typing import Any
 
 import pytest
-from vecenv_eval.demos.demos import make_options
-from vecenv_eval.runner import ConfigError, EvalConfig, Evaluation
+from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.demos.options import make_options
+from vecenv_eval.runner import Evaluation
 
 import vecenv
 from vecenv.libero.env import LiberoConfig, LiberoEnv

@@ -7,7 +7,6 @@ package needs no import of theirs. Nothing heavy is imported before a command ru
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.metadata
 import json
@@ -15,6 +14,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
+
+from vecenv.util.names import unknown
 
 if TYPE_CHECKING:
     from vecenv.protocols import Protocol
@@ -103,12 +104,6 @@ def _list_protocols(suite: str, as_json: bool) -> None:
         typer.echo(json.dumps([each.to_dict() for each in chosen], indent=2))
     else:
         _print_protocols(chosen)
-
-
-def unknown(what: str, given: str, known: Sequence[str]) -> str:
-    """Say that a name is not known, and which known names come close (all of them when none does)."""
-    close = difflib.get_close_matches(given, known, n=3) or known
-    return f"unknown {what} {given!r}: did you mean {', '.join(close)}?"
 
 
 def _version(wanted: bool) -> None:

@@ -14,9 +14,9 @@ from vecenv import family, protocols
 
 if TYPE_CHECKING:
     from vecenv.contract import BatchEnv
-    from vecenv_eval.runner import EvalConfig
+    from vecenv_eval.config import EvalConfig
 
-# What a family has no choice of.
+# Stands for a choice that a family of suites does not have.
 NONE = "-"
 
 
@@ -25,7 +25,7 @@ def conditions(env: BatchEnv, config: EvalConfig) -> dict[str, Any]:
 
     Args:
         env: the environment, whose own configuration is what counts.
-        config: what was asked for, for environments that do not say.
+        config: what was asked for, for environments without a configuration.
 
     Returns:
         Plain types: ``protocol``; ``instead``, options that are not the protocol's, name -> [the protocol's, the one in
@@ -93,7 +93,7 @@ def _of(env: BatchEnv, *path: str) -> Any:
     return value
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """An option as JSON and a reader see it."""
     if isinstance(value, protocols.ResetLoop):
         return asdict(value)

@@ -14,7 +14,7 @@ from vecenv.placement import ALL, SpecError, parse_episodes, parse_tasks
 
 __all__ = ["ALL", "MAX_SLOTS", "Batch", "Episode", "SpecError", "Suite", "parse_episodes", "parse_tasks", "plan"]
 
-# Most episodes that run at once, where neither the user nor the suite says otherwise.
+# Most episodes that run at once, where neither the user nor the suite sets another number.
 MAX_SLOTS = 256
 
 
@@ -46,10 +46,10 @@ class Suite:
         name: name of the suite.
         instructions: language instruction of each task.
         scenes: what each task needs built; tasks with equal entries share it.
-        num_episodes: episodes that can be run, of each task or task by task (0 where there are none).
-        every: those that ``"all"`` runs, likewise; None for all that can be run.
+        num_episodes: episodes that can be run, one number for all tasks or one a task (0 where there are none).
+        every: how many of them ``"all"`` runs; None for all.
         tasks: name of each task, by which it may be asked for; may be empty.
-        max_slots: most episodes to run at once unless told otherwise.
+        max_slots: most episodes to run at once by default.
     """
 
     name: str

@@ -77,7 +77,7 @@ class Summary:
         wall_s: seconds spent running episodes, the policy's included.
         steps_per_s: ``steps / wall_s``.
         extras: what the policy reported (``Record.extras``), by name: the mean an episode of what is a number, how
-            often each was said of what is words.
+            often each text was reported.
         stand_ins: how many episodes ran with what in place of a missing file.
         conditions: what the episodes ran under, see ``vecenv_eval.conditions``; empty when no environment was made.
     """
@@ -246,10 +246,10 @@ def _extras(records: Sequence[Record]) -> dict[str, float | dict[str, int]]:
 def _extras_lines(summary: Summary) -> list[str]:
     """What the policy reported, one line a name."""
 
-    def say(value: float | dict[str, int]) -> str:
+    def describe_value(value: float | dict[str, int]) -> str:
         return "; ".join(f"{n} x {what}" for what, n in value.items()) if isinstance(value, dict) else f"{value:,.4g}"
 
-    return [f"- {name}: {say(value)}" for name, value in summary.extras.items() if value != {}]
+    return [f"- {name}: {describe_value(value)}" for name, value in summary.extras.items() if value != {}]
 
 
 def _seconds(records: Iterable[Record]) -> tuple[float, float]:

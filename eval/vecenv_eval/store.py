@@ -3,7 +3,7 @@
 A folder holds ``config.json`` (what was asked, versions, machine, commit), ``episodes.jsonl`` (append-only, one
 :class:`Record` a line, synced to disk), ``errors.log`` (tracebacks of batches that failed), and at the end
 ``summary.json`` and ``report.md``. ``demos/`` holds what was executed, where that was asked for
-(``vecenv_eval.demos.demos``). Reading tolerates a last line that a crash cut off.
+(``vecenv_eval.demos``). Reading tolerates a last line that a crash cut off.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ from vecenv_eval.episodes import Episode
 
 CONFIG, EPISODES, ERRORS, SUMMARY, REPORT = "config.json", "episodes.jsonl", "errors.log", "summary.json", "report.md"
 DEMOS = "demos"
+# Where results folders go unless something else is asked for.
+RESULTS = Path("results")
 
 
 class StoreError(InvalidFile):
-    """A results folder cannot be made, read or gone on with; the message names the file."""
+    """A results folder cannot be made, read or resumed; the message names the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +49,8 @@ class Record:
         batch: which batch of that run.
         setup_s: seconds it took to place the batch (building or re-placing the environment, and reset).
         wall_s: seconds from then until this episode ended, the policy's included.
-        extras: what the policy has to say about the episode, numbers and words by name.
-        stand_ins: a sentence for each file that was missing and had something plain in its place.
+        extras: what the policy reports about the episode, numbers and texts by name.
+        stand_ins: a sentence for each file that was missing and what was used instead.
     """
 
     suite: str
@@ -89,7 +91,9 @@ class ResultStore:
             StoreError: something is in the way.
         """
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise StoreError(f"{folder} is already there and not empty: name another folder, or go on with --resume")
+            raise StoreError(
+                f"{folder} is already there and not empty: name another folder, or continue it with --resume"
+            )
         folder.mkdir(parents=True, exist_ok=True)
         store = cls(folder)
         store.write_config(config)
@@ -195,7 +199,7 @@ def _parse(line: str, where: str) -> Record:
     known = {f.name for f in fields(Record)}
     try:
         values = {key: value for key, value in json.loads(line).items() if key in known}
-        # Files of before had one verdict, which was both.
+        # Older files have one verdict, which is both.
         both = {name: values.get(name, values["success"]) for name in ("success_first", "success_final")}
         return Record(**{**values, **both, "stand_ins": tuple(values.get("stand_ins", ()))})
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
-from vecenv_eval import bench
+from vecenv_eval.bench.physics import make_batch, random_actions
+from vecenv_eval.bench.table import publish
 
 from vecenv.cli import build_app
 
@@ -18,16 +19,16 @@ def invoke(*arguments: object) -> Result:
 
 
 def test_every_side_gets_the_same_actions() -> None:
-    few, many = bench.random_actions(2, tick=7), bench.random_actions(2, tick=8)
+    few, many = random_actions(2, tick=7), random_actions(2, tick=8)
     np.testing.assert_array_equal(few, many)
-    assert not np.array_equal(few, bench.random_actions(2, tick=10))
+    assert not np.array_equal(few, random_actions(2, tick=10))
     assert np.abs(few[:, :6]).max() <= 0.5
     assert set(np.abs(few[:, 6])) == {1.0}
 
 
 @pytest.mark.parametrize("num_envs", [1, 64, 1024])
 def test_batches_have_the_size_asked_for(num_envs: int) -> None:
-    env = bench.make_batch("libero_object", 0, num_envs, threads=1)
+    env = make_batch("libero_object", 0, num_envs, threads=1)
     assert env.num_envs == num_envs
     env.close()
 
@@ -40,7 +41,7 @@ def test_a_scene_that_is_none_is_refused(text: str) -> None:
 
 
 def test_rows_are_written_with_machine_and_versions(tmp_path: Path) -> None:
-    bench.publish([{"scene": "a/0", "ratio": 2.5}], "a table", tmp_path / "deep" / "rows.json")
+    publish([{"scene": "a/0", "ratio": 2.5}], "a table", tmp_path / "deep" / "rows.json")
     content = json.loads((tmp_path / "deep" / "rows.json").read_text())
     assert content["rows"] == [{"scene": "a/0", "ratio": 2.5}]
     assert content["machine"]["cores"] >= 1

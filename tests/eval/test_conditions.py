@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 from vecenv_eval.conditions import NONE, conditions, describe
+from vecenv_eval.config import EvalConfig
 from vecenv_eval.report import markdown, summarise, table
-from vecenv_eval.runner import EvalConfig, Evaluation, begin, evaluate, go_on
+from vecenv_eval.results import begin, resume
+from vecenv_eval.runner import Evaluation, evaluate
 from vecenv_eval.store import Record
 
 import vecenv
@@ -89,7 +91,7 @@ def test_every_report_names_them(tmp_path: Path) -> None:
     assert describe(said) in report
     assert all(f"{name} " in describe(said) for name in NAMES)
     assert table(result.summary).caption == describe(said)
-    again, store = go_on(tmp_path / "run")
+    again, store = resume(tmp_path / "run")
     assert Evaluation(again).run(store).summary.conditions == said
 
 

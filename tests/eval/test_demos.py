@@ -12,16 +12,11 @@ import h5py
 import numpy as np
 import pytest
 from support.demo_files import FIXTURES, mjcf, replace, some_rollout, write
-from vecenv_eval.demos.demos import (
-    Demo,
-    DemoError,
-    MadeStart,
-    Recording,
-    StoredStart,
-    make_options,
-    read_demos,
-    write_demos,
-)
+from vecenv_eval.demos.hdf5 import DemoError
+from vecenv_eval.demos.options import make_options
+from vecenv_eval.demos.read import read_demos
+from vecenv_eval.demos.schema import Demo, MadeStart, Recording, StoredStart
+from vecenv_eval.demos.write import write_demos
 
 import vecenv
 from vecenv.libero.tasks.suites import task as task_spec

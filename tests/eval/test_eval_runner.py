@@ -11,20 +11,12 @@ import numpy as np
 import pytest
 from support.fakes import SUITE, FakeEnv, FakeWorld
 from vecenv_eval import policies
+from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.drive import PolicyStuck, drive
 from vecenv_eval.episodes import Episode, SpecError
 from vecenv_eval.policies import PolicyError
-from vecenv_eval.runner import (
-    ConfigError,
-    EvalConfig,
-    EvalResult,
-    Evaluation,
-    PolicyStuck,
-    Progress,
-    begin,
-    drive,
-    evaluate,
-    go_on,
-)
+from vecenv_eval.results import EvalResult, Progress, begin, resume
+from vecenv_eval.runner import Evaluation, evaluate
 from vecenv_eval.store import ResultStore, StoreError
 
 from vecenv.contract import BatchEnv, Control, ResetInfo
@@ -62,8 +54,8 @@ def run(folder: Path, world: FakeWorld, progress: list[Progress] | None = None, 
     return evaluate(config, begin(config, folder), simulator=world.simulator, on_progress=seen.append)
 
 
-def resume(folder: Path, world: FakeWorld, **changes: Any) -> EvalResult:
-    config, store = go_on(folder, **changes)
+def run_again(folder: Path, world: FakeWorld, **changes: Any) -> EvalResult:
+    config, store = resume(folder, **changes)
     return evaluate(config, store, simulator=world.simulator)
 
 
@@ -157,7 +149,7 @@ def test_a_run_can_stop_at_the_first_error(folder: Path) -> None:
 def test_resuming_tries_again_what_failed_and_only_that(folder: Path) -> None:
     run(folder, FakeWorld(raise_in={0: ValueError("boom")}), num_envs=5)
     world = FakeWorld()
-    result = resume(folder, world)
+    result = run_again(folder, world)
     assert [(list(env.tasks), list(env.episodes)) for env in world.envs] == [([0] * 4, [1, 2, 3, 4])]
     assert result.ok
     assert [r.run for r in result.records if r.task == 0] == [0, 1, 1, 1, 1]
@@ -170,13 +162,13 @@ def test_ctrl_c_keeps_what_was_computed(folder: Path) -> None:
     assert not result.ok
     assert [r.key for r in result.records] == [*(Episode(SUITE, 0, e) for e in range(5)), Episode(SUITE, 2, 0)]
     assert json.loads((folder / "summary.json").read_text())["total"]["missing"] == 14
-    assert resume(folder, FakeWorld(), num_envs=7).ok
+    assert run_again(folder, FakeWorld(), num_envs=7).ok
 
 
 def test_resuming_a_complete_run_builds_nothing(folder: Path) -> None:
     first = run(folder, FakeWorld())
     world = FakeWorld()
-    assert resume(folder, world).records == first.records
+    assert run_again(folder, world).records == first.records
     assert world.envs == []
 
 
@@ -248,7 +240,7 @@ def test_the_folder_says_how_it_came_about(folder: Path) -> None:
     assert "| 0 | do thing 0 | 5/5 | 100.0% |" in (folder / "report.md").read_text()
 
 
-def test_a_folder_of_something_else_cannot_be_gone_on_with(tmp_path: Path) -> None:
+def test_a_folder_of_something_else_cannot_be_resumed(tmp_path: Path) -> None:
     store = ResultStore.create(tmp_path / "other", {"config": {"colour": "red"}, "runs": []})
     with pytest.raises(StoreError, match="does not hold an evaluation"):
-        go_on(store.folder)
+        resume(store.folder)

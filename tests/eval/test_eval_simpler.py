@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 from typer.testing import CliRunner
-from vecenv_eval.runner import ConfigError, EvalConfig, Evaluation, begin, default_policy, evaluate, go_on
+from vecenv_eval.config import ConfigError, EvalConfig, default_policy
+from vecenv_eval.results import begin, resume
+from vecenv_eval.runner import Evaluation, evaluate
 
 from vecenv.cli import build_app
 
@@ -49,7 +51,7 @@ def test_a_google_task_is_asked_for_by_name(tmp_path: Path) -> None:
 def test_what_stood_in_is_in_records_and_report_and_survives_a_resume(tmp_path: Path) -> None:
     store = begin(config(tasks="0"), tmp_path / "r")
     summary = evaluate(config(tasks="0", episodes="1"), store).summary
-    again, store = go_on(tmp_path / "r")
+    again, store = resume(tmp_path / "r")
     summary = evaluate(again, store).summary
     (note,) = summary.stand_ins
     assert summary.stand_ins[note] == 2

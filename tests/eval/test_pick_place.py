@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vecenv_eval.policies.pick_place import PickPlacePolicy
-from vecenv_eval.policies.pick_place_goals import in_order
-from vecenv_eval.policies.pick_place_motion import (
+from vecenv_eval.policies.pick_place.goals import in_order
+from vecenv_eval.policies.pick_place.motion import (
     CLOSE,
     Waypoint,
     WaypointFollower,
     rotation_matrices,
     rotation_vectors,
 )
+from vecenv_eval.policies.pick_place.policy import PickPlacePolicy
 
 import vecenv
 from vecenv.contract import BatchEnv, Egocentric, Metrics, Objects, ObjectsSnapshot, PointCloud, ResetInfo

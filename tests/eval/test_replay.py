@@ -17,18 +17,14 @@ from support import demo_files, upstream
 from support.demo_files import Rollout
 from support.fakes import SUITE, FakeEnv, FakeWorld
 from typer.testing import CliRunner, Result
-from vecenv_eval.demos.demos import fixture_poses
+from vecenv_eval.config import EvalConfig
+from vecenv_eval.demos.files import find_files, read_files
+from vecenv_eval.demos.mjcf import fixture_poses
+from vecenv_eval.demos.outcomes import ReplayReport, closing_line
 from vecenv_eval.demos.record import Recorder, RecordError
-from vecenv_eval.demos.replay import (
-    NO_FIXTURES,
-    ReplayConfig,
-    ReplayReport,
-    closing_line,
-    find_files,
-    read_files,
-    replay,
-)
-from vecenv_eval.runner import EvalConfig, EvalResult, begin, evaluate, go_on
+from vecenv_eval.demos.replay import NO_FIXTURES, ReplayConfig, replay
+from vecenv_eval.results import EvalResult, begin, resume
+from vecenv_eval.runner import evaluate
 
 from vecenv.cli import build_app
 from vecenv.contract import BatchEnv, Control, ResetInfo, State
@@ -398,7 +394,7 @@ def test_a_batch_that_raises_leaves_the_recordings_of_what_has_a_verdict(tmp_pat
     result = record(tmp_path / "r", world, tasks="0")
     kept = {f"{r.task}/demo_{r.episode}" for r in result.records if not r.error}
     assert recorded(tmp_path / "r").keys() == kept == {"0/demo_0"}
-    config, store = go_on(tmp_path / "r")
+    config, store = resume(tmp_path / "r")
     assert config.record
     evaluate(config, store, simulator=VisibleWorld().simulator)
     assert len(recorded(tmp_path / "r")) == 5

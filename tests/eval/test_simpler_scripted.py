@@ -11,9 +11,9 @@ pytest.importorskip("sapien")
 pytest.importorskip("ruckig")
 
 from vecenv_eval.policies import make_policy
-from vecenv_eval.policies import simpler_drawers as drawers
-from vecenv_eval.policies.simpler_grasps import choose
-from vecenv_eval.policies.simpler_reach import HANDS, Arm
+from vecenv_eval.policies.simpler import drawers
+from vecenv_eval.policies.simpler.grasps import choose
+from vecenv_eval.policies.simpler.reach import HANDS, Arm
 
 from vecenv import make
 from vecenv.contract import Control, Part, PartJoint, PointCloud

@@ -6,10 +6,10 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.libero.tasks.suites import TaskSpec
 
@@ -28,7 +28,7 @@ class Rollout:
 
 
 def mjcf(fixtures: Mapping[str, str] = FIXTURES, inside: str = "") -> str:
-    """As much of an MJCF of libero_goal as says where fixtures are: name -> position."""
+    """The part of an MJCF of libero_goal that has the poses of fixtures: name -> position."""
     bodies = "".join(f'<body name="{name}_main" pos="{pos}"/>' for name, pos in fixtures.items())
     return f'<mujoco model="base"><worldbody><body name="floor"/>{bodies}{inside}</worldbody></mujoco>'
 
@@ -66,7 +66,7 @@ def _write_demo(group: h5py.Group, rollout: Rollout) -> None:
         group.attrs["final_state"] = rollout.final_state
 
 
-def replace(group: Any, name: str, value: Any) -> None:
-    """Put another dataset where one is."""
+def replace(group: h5py.Group, name: str, value: npt.ArrayLike) -> None:
+    """Replace a dataset of a group."""
     del group[name]
     group[name] = value

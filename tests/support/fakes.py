@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from vecenv_eval.episodes import Suite
-from vecenv_eval.runner import Simulator
+from vecenv_eval.simulator import Simulator
 
 from vecenv.contract import Control, EePoseControl, Egocentric, Metrics, Objects, PlanControl, ResetInfo
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.voxposer_world import HOME, Obedient, box, handle, snapshot
+from vecenv_eval.drive import drive
 from vecenv_eval.policies import extras_of, make_policy
-from vecenv_eval.runner import drive
 
 import vecenv
 from vecenv.contract import ObjectsSnapshot

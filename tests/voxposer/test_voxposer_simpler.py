@@ -98,8 +98,8 @@ def test_other_environments_are_left_as_they_are_and_other_robots_refused() -> N
 @pytest.mark.heavy
 @pytest.mark.parametrize("task", range(4))
 def test_the_rule_based_model_solves_an_episode_of_every_task(task: int, original: Path) -> None:
+    from vecenv_eval.drive import drive
     from vecenv_eval.policies import make_policy
-    from vecenv_eval.runner import drive
 
     env = vecenv.make(BRIDGE, task=task, episodes=[0, 2], assets=original, num_threads=1)
     policy = make_policy("voxposer")

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import typer
 
-from vecenv.cli import fail, unknown
+from vecenv.cli import fail
+from vecenv.util.names import unknown
 
 
 def compile_command(

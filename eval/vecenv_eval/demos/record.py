@@ -2,7 +2,7 @@
 
 A freshly reset batch comes in; while :class:`Recorder` listens, every control tick is noted: which slots moved and with
 which actions, whatever verb the policy used. When the batch ends, each finished slot becomes a
-:class:`~vecenv_eval.demos.demos.Recording`.
+:class:`~vecenv_eval.demos.schema.Recording`.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.contract import BatchEnv, State
 from vecenv.errors import InvalidFile
-from vecenv_eval.demos.demos import Recording
+from vecenv_eval.demos.schema import Recording
 
 
 class RecordError(InvalidFile):
@@ -28,7 +29,7 @@ class Recorder:
     Args:
         env: the batch, just reset.
         episodes: episode index of each slot.
-        options: what ``vecenv.make`` was called with, see ``vecenv_eval.demos.demos.make_options``.
+        options: what ``vecenv.make`` was called with, see ``vecenv_eval.demos.options.make_options``.
         states: also keep the state before every tick.
 
     Raises:
@@ -104,6 +105,6 @@ def _of_slot(options: Mapping[str, Any], slot: int) -> dict[str, Any]:
     return {**options, "fixtures": own}
 
 
-def _row(values: Any, slot: int) -> list[float]:
+def _row(values: npt.ArrayLike, slot: int) -> list[float]:
     array = np.asarray(values, float)
     return (array if array.ndim == 1 else array[slot]).tolist()

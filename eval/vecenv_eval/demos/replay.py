@@ -1,37 +1,29 @@
 """Recorded actions, executed again: does the simulation here come to the verdicts on record?
 
-Demonstrations come in (``vecenv_eval.demos.demos``); those that can share a batch are placed as their file says,
-stepped tick by tick with their own actions, and judged at or before their own last one. A :class:`ReplayReport` goes
-out: both verdicts of each demonstration, how far its state ended from the one on record, and how often the verdicts
-agree.
+Demonstrations come in (``vecenv_eval.demos.schema``); those that can share a batch are placed as their file says,
+stepped tick by tick with their own actions, and judged at or before their own last one. A
+:class:`~vecenv_eval.demos.outcomes.ReplayReport` goes out.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
-from rich.text import Text
 
 import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.contract import ACTION_DIM, Control
-from vecenv.errors import InvalidInput
-from vecenv_eval.demos.demos import SUFFIXES, Demo, DemoError, MadeStart, StoredStart, Unreadable, read_demos
+from vecenv.libero.env import LiberoEnv
+from vecenv_eval.demos.hdf5 import DemoError, Unreadable
+from vecenv_eval.demos.outcomes import Outcome, ReplayReport
 from vecenv_eval.demos.record import flat_state
-from vecenv_eval.report import CONFIDENCE, wilson
+from vecenv_eval.demos.schema import Demo, MadeStart, StoredStart
 
 NO_FIXTURES = "no model_file: fixtures at their centres"
-
-
-class ReplayError(InvalidInput):
-    """There is nothing to replay; the message says what was looked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,110 +43,6 @@ class ReplayConfig:
     num_threads: int | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """How one demonstration went.
-
-    Attributes:
-        path, name: the file, and the demonstration's name in it.
-        suite, task: what it is a demonstration of.
-        recorded: the verdict on record, None where there is none.
-        replayed: the verdict of the replay, at or before the last action.
-        length: actions on record.
-        ticks: control ticks executed; fewer than ``length`` when it was solved before.
-        qpos_error, qvel_error: largest difference from the state on record (metres and radians; per second) after
-            ``ticks``, or before the last action where the file has no later one; None where it has none.
-        fault: why the physics failed, "" when it did not.
-        note: what a reader should know about the comparison.
-    """
-
-    path: Path
-    name: str
-    suite: str
-    task: int
-    recorded: bool | None
-    replayed: bool
-    length: int
-    ticks: int
-    qpos_error: float | None
-    qvel_error: float | None
-    fault: str = ""
-    note: str = ""
-
-    @property
-    def agrees(self) -> bool | None:
-        """Whether the verdicts are the same; None without one on record."""
-        return None if self.recorded is None else self.recorded == self.replayed
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReplayReport:
-    """Every outcome, and what could not be replayed."""
-
-    outcomes: tuple[Outcome, ...]
-    problems: tuple[Unreadable, ...]
-
-    @property
-    def compared(self) -> int:
-        """Demonstrations with a verdict on record."""
-        return sum(outcome.recorded is not None for outcome in self.outcomes)
-
-    @property
-    def agreeing(self) -> int:
-        """Those whose replay came to the same."""
-        return sum(outcome.agrees is True for outcome in self.outcomes)
-
-    @property
-    def ok(self) -> bool:
-        """Every demonstration was replayed, and verdicts were compared and agree."""
-        return not self.problems and 0 < self.compared == self.agreeing
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain types, ready for JSON."""
-        low, high = wilson(self.agreeing, self.compared) if self.compared else (None, None)
-        return {
-            "compared": self.compared,
-            "agreeing": self.agreeing,
-            "low": low,
-            "high": high,
-            "interval": f"wilson {CONFIDENCE}",
-            "ok": self.ok,
-            "demos": [{**vars(o), "path": str(o.path), "agrees": o.agrees} for o in self.outcomes],
-            "problems": [{**vars(p), "path": str(p.path)} for p in self.problems],
-        }
-
-
-def find_files(paths: Iterable[Path]) -> list[Path]:
-    """The files among the paths, and the HDF5 files in the folders among them, at any depth, sorted.
-
-    Raises:
-        ReplayError: a path does not exist, or a folder holds no HDF5 file.
-    """
-    files: list[Path] = []
-    for path in paths:
-        found = sorted(p for p in path.rglob("*") if p.suffix in SUFFIXES) if path.is_dir() else [path]
-        if not path.exists() or not found:
-            raise ReplayError(f"{path}: {'no HDF5 file in this folder' if path.is_dir() else 'no such file'}")
-        files += found
-    return list(dict.fromkeys(files))
-
-
-def read_files(
-    files: Iterable[Path], *, suite: str | None = None, task: int | None = None
-) -> tuple[list[Demo], list[Unreadable]]:
-    """Every demonstration of the files, and what cannot be used; see ``vecenv_eval.demos.demos.read_demos``."""
-    demos: list[Demo] = []
-    problems: list[Unreadable] = []
-    for path in files:
-        try:
-            good, bad = read_demos(path, suite=suite, task=task)
-        except DemoError as error:
-            good, bad = [], [Unreadable(path=path, name="", reason=str(error).removeprefix(f"{path}: "))]
-        demos += good
-        problems += bad
-    return demos, problems
-
-
 def replay(
     demos: Sequence[Demo],
     config: ReplayConfig | None = None,
@@ -166,7 +54,7 @@ def replay(
     Args:
         demos: what to replay.
         config: how.
-        on_batch: told in a line what each batch is, before it runs.
+        on_batch: called with one line about each batch, before it runs.
 
     Returns:
         Outcomes in the order of ``demos``. What the simulator refuses to place is a problem of that batch alone.
@@ -187,51 +75,6 @@ def replay(
             reason = f"cannot be replayed: {type(error).__name__}: {' '.join(str(error).split())}"
             problems += [Unreadable(path=demo.path, name=demo.name, reason=reason) for demo in chosen]
     return ReplayReport(outcomes=tuple(outcomes[i] for i in sorted(outcomes)), problems=tuple(problems))
-
-
-def table(report: ReplayReport) -> Table:
-    """The outcomes as a table for the screen; with file names where a task has several files."""
-    named = {outcome.path: (outcome.suite, outcome.task) for outcome in report.outcomes}
-    several = len(set(named.values())) < len(named)
-    result = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    result.collapse_padding = True
-    for column in ("task", "demo", "recorded", "replayed", "ticks", "max |dq|", *(["file"] if several else []), "note"):
-        free = column in ("file", "note")
-        result.add_column(column, justify="left" if free or column == "task" else "right", no_wrap=not free)
-    for outcome in report.outcomes:
-        result.add_row(*map(Text, _cells(outcome, several)), style="red" if outcome.agrees is False else None)
-    return result
-
-
-def _cells(outcome: Outcome, named: bool) -> list[str]:
-    return [
-        f"{outcome.suite}/{outcome.task}",
-        outcome.name,
-        _verdict(outcome.recorded),
-        _verdict(outcome.replayed),
-        f"{outcome.ticks}/{outcome.length}",
-        "-" if outcome.qpos_error is None else f"{outcome.qpos_error:.1e}",
-        *([outcome.path.name] if named else []),
-        "; ".join(filter(None, (outcome.fault, outcome.note))),
-    ]
-
-
-def closing_line(report: ReplayReport) -> str:
-    """How often the verdicts agree, in a sentence."""
-    without = len(report.outcomes) - report.compared
-    rest = "".join(
-        f", {count} {what}"
-        for count, what in ((without, "without a verdict on record"), (len(report.problems), "not replayed"))
-        if count
-    )
-    if not report.compared:
-        return f"no verdicts to compare{rest}"
-    low, high = wilson(report.agreeing, report.compared)
-    return f"verdicts agree: {report.agreeing}/{report.compared} (95 % interval {low:.1%}-{high:.1%}){rest}"
-
-
-def _verdict(success: bool | None) -> str:
-    return "?" if success is None else "solved" if success else "failed"
 
 
 # -- batches -----------------------------------------------------------------------------------------------------------
@@ -255,7 +98,7 @@ def _start_key(start: StoredStart | MadeStart) -> Hashable:
     return None if start.fixtures is None else frozenset(start.fixtures)
 
 
-def _make(demos: Sequence[Demo], config: ReplayConfig) -> Any:
+def _make(demos: Sequence[Demo], config: ReplayConfig) -> LiberoEnv:
     """The environment with one slot a demonstration, reset and in the start states."""
     stored = [demo.start for demo in demos if isinstance(demo.start, StoredStart)]
     made = [demo.start for demo in demos if isinstance(demo.start, MadeStart)]  # one list is empty: see _start_key
@@ -267,7 +110,8 @@ def _make(demos: Sequence[Demo], config: ReplayConfig) -> Any:
     for name in ("backend", "contacts"):
         if getattr(config, name) is not None:
             options[name] = getattr(config, name)
-    env: Any = vecenv.make(demos[0].suite, tasks=list(episodes), episodes=episodes, **options)
+    env = vecenv.make(demos[0].suite, tasks=list(episodes), episodes=episodes, **options)
+    assert isinstance(env, LiberoEnv)  # demonstrations are of LIBERO's suites
     try:
         env.reset()
         if stored:
@@ -289,7 +133,7 @@ def _stored_options(starts: Sequence[StoredStart]) -> dict[str, Any]:
     return options
 
 
-def _load(env: Any, starts: Sequence[StoredStart]) -> None:
+def _load(env: LiberoEnv, starts: Sequence[StoredStart]) -> None:
     """Put each slot into its stored state; the controller keeps its memory of the reset, as upstream's does."""
     state = env.state()
     qpos, qvel, time = state.qpos.copy(), state.qvel.copy(), state.time.copy()
@@ -310,8 +154,8 @@ def _replay_batch(demos: Sequence[Demo], config: ReplayConfig) -> list[Outcome]:
         env.close()
 
 
-def _step_through(env: Any, demos: Sequence[Demo]) -> list[Outcome]:
-    """Step until every demonstration has been judged; one that is through idles beside the others."""
+def _step_through(env: LiberoEnv, demos: Sequence[Demo]) -> list[Outcome]:
+    """Step until every demonstration has been judged; one that has ended idles beside the others."""
     lengths = np.array([len(demo) for demo in demos])
     outcomes: list[Outcome | None] = [None] * len(demos)
     nq = env.state().nq
@@ -328,7 +172,7 @@ def _step_through(env: Any, demos: Sequence[Demo]) -> list[Outcome]:
     return [outcome for outcome in outcomes if outcome is not None]
 
 
-def _states(env: Any, chosen: np.ndarray) -> dict[int, np.ndarray]:
+def _states(env: LiberoEnv, chosen: np.ndarray) -> dict[int, np.ndarray]:
     if not chosen.any():
         return {}
     state = env.state()
@@ -347,7 +191,7 @@ def _actions(demos: Sequence[Demo], tick: int) -> np.ndarray:
 
 
 def _outcome(demo: Demo, control: Control, slot: int, nq: int, before: np.ndarray | None, after: np.ndarray) -> Outcome:
-    """What became of a slot that has just been judged, with its states before and after its last action."""
+    """The outcome of a slot that has just been judged, with its states before and after its last action."""
     ticks = int(control.step_index[slot])
     notes = [NO_FIXTURES] if isinstance(demo.start, StoredStart) and demo.start.fixtures is None else []
     try:

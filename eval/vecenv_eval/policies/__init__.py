@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,9 +18,9 @@ from vecenv.contract import BatchEnv, Control, ResetInfo
 from vecenv.errors import InvalidInput
 
 BUILTIN = {
-    "pick_place": "vecenv_eval.policies.pick_place:PickPlacePolicy",
+    "pick_place": "vecenv_eval.policies.pick_place.policy:PickPlacePolicy",
     "random": "vecenv_eval.policies.random:RandomPolicy",
-    "simpler_scripted": "vecenv_eval.policies.simpler_scripted:SimplerScriptedPolicy",
+    "simpler_scripted": "vecenv_eval.policies.simpler.policy:SimplerScriptedPolicy",
     "voxposer": "vecenv_eval.policies.voxposer:VoxPoserPolicy",
     "zero": "vecenv_eval.policies.scripted:ZeroPolicy",
 }
@@ -49,14 +49,14 @@ class Policy(Protocol):
 
         Returns:
             Actions for ``step_continuous``, [B, 7] or a chunk [B, K, 7] (rows of finished slots are ignored); or, from
-            a policy that stepped the environment itself (say with ``step_ee_pose``), the ``Control`` it got.
+            a policy that stepped the environment itself (with ``step_ee_pose``, for example), the ``Control`` it got.
         """
         ...
 
 
 @runtime_checkable
 class Reporting(Protocol):
-    """A policy that has something to say about each episode beyond the verdict; optional."""
+    """A policy that reports more about each episode than the verdict; optional."""
 
     def extras(self, slot: int) -> Mapping[str, Any]:
         """Numbers and words about the episode in a slot, which has just finished; they go into its record."""
@@ -94,7 +94,7 @@ def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
     return policy
 
 
-def _load(name: str) -> Any:
+def _load(name: str) -> Callable[..., object]:
     """The class or function that makes the policy."""
     target = BUILTIN.get(name, name)
     module_name, separator, attribute = target.partition(":")

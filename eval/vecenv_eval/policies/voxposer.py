@@ -21,7 +21,7 @@ class VoxPoserPolicy:
     Args:
         model: litellm's name of the model that writes the programs.
         prompts_dir: a folder of prompts to use in place of the package's own.
-        passes: how often an instruction is planned anew when it was followed to the end without success.
+        passes: how often an instruction is planned again after it was followed to the end without success.
         api_base: address of the model's provider, litellm's own by default.
 
     Attributes:

@@ -26,7 +26,7 @@ from vecenv.simpler.control.rotations import (
 from vecenv.simpler.control.servo import Servo, ServoConfig
 from vecenv.simpler.control.urdf import read_urdf
 
-# Steps of the way at which the inverse kinematics is solved anew, metres and radians: what a control tick covers.
+# Steps of the way at which the inverse kinematics is solved again, metres and radians: what a control tick covers.
 _STRIDE, _TURN = 0.05, 0.3
 # Like the controllers' inverse kinematics, but it takes larger steps: a rehearsal need not be as exact.
 _QUICK = Clik(tolerance=1e-3, max_iterations=40, step=0.4)
@@ -47,7 +47,7 @@ class Hand:
         depth: where the tool's origin belongs when something is grasped, so far beyond its centre: widths, and the
             depth for each, where the fingers meet it with their pads; linear between.
         palm: things reach at most so far into the hand, from the tool's origin back.
-        thickness: of the closed fingers, across ``opening``, half of it. edge: likewise of their tips.
+        thickness: of the closed fingers, across ``opening``, half of it. edge: the same of their tips.
         close_ticks: control ticks that closing takes. settle_ticks: ticks to come to rest before it.
     """
 
@@ -132,7 +132,7 @@ class Arm:
 
         Args:
             qpos: joints, [N]. base: world pose of the robot's root, [7].
-            positions: world positions of the stops, [C, T, 3]. rotations: likewise, [C, T, 3, 3].
+            positions: world positions of the stops, [C, T, 3]. rotations: world rotations of the stops, [C, T, 3, 3].
 
         Returns:
             How far the joints stay from their limits, radians, [C]; minus infinity where the inverse kinematics finds

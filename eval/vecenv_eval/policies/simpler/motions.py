@@ -1,7 +1,7 @@
 """How each family of SIMPLER's tasks is solved with ground truth: scripts that yield waypoints and get a new look.
 
 A script is a generator: it yields a list of ``Waypoint`` for its own slot, and is sent a ``Look`` at what came of it.
-It ends when it has done what it can; the policy begins it anew while the task is not solved. Geometry comes from the
+It ends when it has done what it can; the policy starts it again while the task is not solved. Geometry comes from the
 look alone; constants here are of the gripper or of a family, never of an episode.
 """
 
@@ -14,9 +14,9 @@ from typing import TypeAlias
 import numpy as np
 
 from vecenv.contract import ObjectsSnapshot
-from vecenv_eval.policies import simpler_drawers as drawers
-from vecenv_eval.policies.simpler_grasps import Grasp, choose
-from vecenv_eval.policies.simpler_reach import Arm, Waypoint, pose, through
+from vecenv_eval.policies.simpler import drawers
+from vecenv_eval.policies.simpler.grasps import Grasp, choose
+from vecenv_eval.policies.simpler.reach import Arm, Waypoint, pose, through
 
 # Above a thing before it is grasped, and above everything while it is carried, metres.
 _ABOVE, _CARRIED = 0.08, 0.10
@@ -30,7 +30,7 @@ _BESIDE = 0.02
 _OPENED = 0.21
 # What is put into a drawer goes in at most so far beside its middle, metres.
 _ASIDE = 0.15
-# A grasp that costs more than this (``simpler_grasps``) is not tried where a thing can be pushed as well.
+# A grasp that costs more than this (``grasps``) is not tried where a thing can be pushed as well.
 _DOUBTFUL = 2.0
 # Pushing: fingers come down so far behind a thing, and move so high above what it stands on, metres; angles from the
 # vertical and sideways that are tried, radians; room that is enough, radians, and what an angle costs.

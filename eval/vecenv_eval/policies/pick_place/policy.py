@@ -1,11 +1,10 @@
 """``pick_place``: a policy with ground truth that solves LIBERO tasks by picking things up and putting them down.
 
 It sees the environment through its public verbs only. Planning happens slot by slot from ``observe_objects``: which
-goal predicate is next (``pick_place_goals``), how to hold the object and where to put it
-(``vecenv.manipulation.placing``), how to get it there (``pick_place_transfer``), how to work drawers and knobs
-(``pick_place_fixtures``). Moving happens for the whole batch at once from ``observe_egocentric().state``
-(``pick_place_motion``). After a lift the object must have come along; if it has not, another grasp is tried, a few
-times. What the policy cannot do it leaves alone, and says so in ``unsupported``.
+goal predicate is next (``goals``), how to hold the object and where to put it (``vecenv.manipulation.placing``), how to
+get it there (``transfer``), how to operate drawers and knobs (``fixtures``). Moving happens for the whole batch at once
+from ``observe_egocentric().state`` (``motion``). After a lift the object must be in the hand; if it is not, another
+grasp is tried, a few times. What the policy cannot do it leaves alone and lists in ``unsupported``.
 """
 
 from __future__ import annotations
@@ -17,12 +16,10 @@ import numpy as np
 from vecenv.contract import BatchEnv, ObjectsSnapshot, ResetInfo
 from vecenv.manipulation.placing import Grasped, choose_grasp
 from vecenv.manipulation.world import Margins, World
-from vecenv_eval.policies import pick_place_fixtures as fixtures
-from vecenv_eval.policies import pick_place_goals as goals
-from vecenv_eval.policies import pick_place_transfer as transfer
-from vecenv_eval.policies.pick_place_fixtures import DrawerHandle
-from vecenv_eval.policies.pick_place_goals import Predicate
-from vecenv_eval.policies.pick_place_motion import MotionConfig, WaypointFollower
+from vecenv_eval.policies.pick_place import fixtures, goals, transfer
+from vecenv_eval.policies.pick_place.fixtures import DrawerHandle
+from vecenv_eval.policies.pick_place.goals import Predicate
+from vecenv_eval.policies.pick_place.motion import MotionConfig, WaypointFollower
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +31,7 @@ class PickPlaceConfig:
         motion: how waypoints are followed.
         handle: how drawers are handled.
         knob_turn: how far knobs are turned at once, radians.
-        attempts: how often a slot may begin anew before it gives up.
+        attempts: how often a slot may start again before it gives up.
         at_rest: things that move less than this between two looks are at rest, metres.
         patience: looks after which a slot plans although things still move.
         home_reach: how far the hand is before the robot's base when an episode begins, metres.

@@ -15,7 +15,7 @@ import numpy as np
 
 from vecenv.contract import Part, PartJoint
 from vecenv.simpler.control.rotations import rotvec_from_rotation
-from vecenv_eval.policies.simpler_reach import Arm, Waypoint, pose, through
+from vecenv_eval.policies.simpler.reach import Arm, Waypoint, pose, through
 
 # Angles of the closed fingers, radians: below the horizontal, and sideways.
 _HOOK_PITCHES = np.deg2rad([25.0, 30.0, 35.0])
@@ -35,7 +35,7 @@ _ENTRY, _SAGS = (1.0, 0.3), 0.02
 _LEAVE = 0.06
 # Fingers may slip this far before they take the drawer along, metres.
 _SLACK = 0.06
-# Pushing begins so far before the front, and goes on so far beyond closed.
+# Pushing begins this far before the front, and ends this far beyond closed.
 _AWAY, _BEYOND = 0.06, 0.01
 # Sideways angles and places off the middle cost as much as this much room at the joints' limits, radians.
 _PREFER_STRAIGHT, _PREFER_MIDDLE = 1.0, 0.2

@@ -23,7 +23,7 @@ class MotionConfig:
 
     Attributes:
         gain: the translation command is this much of the remaining way; above 1 it arrives sooner.
-        turn_gain: likewise for rotation.
+        turn_gain: the same for rotation.
         translation_unit: metres that a translation action of 1 stands for.
         rotation_unit: radians that a rotation action of 1 stands for.
         stall_ticks: this many ticks without progress end a waypoint.
@@ -57,7 +57,7 @@ class Waypoint:
         rotation: of the hand, [3, 3].
         grip: ``OPEN``, ``CLOSE``, or ``HOLD`` to leave the fingers where they are.
         tolerance: distance at which the waypoint counts as reached, metres.
-        turn_tolerance: angle likewise, radians.
+        turn_tolerance: the same for the angle, radians.
         fingers: move the fingers until they rest, instead of arriving.
         ticks: stay for this many ticks, instead of arriving; 0 for not.
         speed: share of full speed.
@@ -162,7 +162,7 @@ class WaypointFollower:
         return (self._still >= self.config.still_ticks) | (self._ticks >= self.config.max_finger_ticks)
 
     def _begin(self, slots: np.ndarray) -> None:
-        """Start counting anew for ``slots``, bool [B]."""
+        """Restart counting for ``slots``, bool [B]."""
         self._ticks[slots], self._idle[slots], self._best[slots] = 0, 0, np.inf
 
     def _errors(self, state: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from vecenv.contract import PointCloud
 from vecenv.simpler.control.rotations import rotvec_from_rotation
-from vecenv_eval.policies.simpler_reach import Arm, Hand
+from vecenv_eval.policies.simpler.reach import Arm, Hand
 
 _TILTS = np.deg2rad([0.0, 10.0, 20.0, 30.0, 45.0])
 _AZIMUTHS = np.linspace(0, 2 * np.pi, 8, endpoint=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vecenv.manipulation.placing import Grasped, Target, carry_height, put_down
 from vecenv.manipulation.world import World, upright
-from vecenv_eval.policies.pick_place_motion import CLOSE, HOLD, OPEN, Waypoint
+from vecenv_eval.policies.pick_place.motion import CLOSE, HOLD, OPEN, Waypoint
 
 
 def pick(world: World, name: str, grasp: Grasped, towards: np.ndarray) -> list[Waypoint]:

@@ -1,8 +1,8 @@
 """``simpler_scripted``: a policy with ground truth that solves SIMPLER's tasks, to show that every task can be solved.
 
 It sees the environment through its public verbs: ``observe_objects`` and joints in, ``step_waypoints`` out. Every slot
-follows a script of its own (``simpler_motions``), grasps are chosen by rehearsing them (``simpler_grasps``,
-``simpler_reach``). A slot that waits for others loses no ticks.
+follows a script of its own (``motions``), grasps are chosen by rehearsing them (``grasps``,
+``reach``). A slot that waits for others loses no ticks.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 from vecenv.contract import BatchEnv, Control, ResetInfo
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.env import SimplerEnv
-from vecenv_eval.policies.simpler_motions import SCRIPTS, Look, Memory, Script
-from vecenv_eval.policies.simpler_reach import Arm, Waypoint
+from vecenv_eval.policies.simpler.motions import SCRIPTS, Look, Memory, Script
+from vecenv_eval.policies.simpler.reach import Arm, Waypoint
 
 
 @dataclass
@@ -33,7 +33,7 @@ class SimplerScriptedPolicy:
     """Ground-truth policy for all 25 tasks of SIMPLER.
 
     Args:
-        attempts: how often a slot may begin anew before it stays where it is.
+        attempts: how often a slot may start again before it stays where it is.
 
     Attributes:
         name: how the policy is called in results.

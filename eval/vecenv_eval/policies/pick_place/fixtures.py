@@ -13,7 +13,7 @@ import numpy as np
 
 from vecenv.contract import RegionBox
 from vecenv.manipulation.world import HOME_ROTATION, World, down_facing, spun, yaw
-from vecenv_eval.policies.pick_place_motion import CLOSE, OPEN, Waypoint
+from vecenv_eval.policies.pick_place.motion import CLOSE, OPEN, Waypoint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class DrawerHandle:
         travel: how far a drawer slides.
         past: pushing and pulling aim this far beyond the end of the travel.
         tilt: of the hand from the vertical while pushing.
-        flat_tilt: likewise for a handle with another above it.
+        flat_tilt: the same for a handle with another above it.
         shallow, deepest: heights of the cabinet's top over a handle, up to which it is pulled with ``tilt``, or at all.
         clear: room before the bar to come down in.
     """
@@ -82,7 +82,7 @@ def close_drawer(world: World, region: RegionBox, handle: DrawerHandle) -> list[
 
 
 def open_drawer(world: World, region: RegionBox, handle: DrawerHandle) -> list[Waypoint] | str:
-    """Pinch a drawer's handle bar from above and below with a tilted hand and pull; or say why not."""
+    """Pinch a drawer's handle bar from above and below with a tilted hand and pull; or return why not."""
     direction = drawer_direction(world, region)
     bar = handle_of(region, direction, handle)
     depth = world.points(region.parent or "")[:, 2].max() - bar[2]

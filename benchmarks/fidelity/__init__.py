@@ -1,0 +1,1 @@
+"""Parts of the command ``benchmarks/mjx_fidelity.py``: recordings, scenes, comparisons, workers and tables."""

@@ -1,0 +1,158 @@
+"""``vecenv eval``: a policy evaluated on a suite, from the command line.
+
+Options or a YAML file come in; a progress bar, a table with Wilson 95 % intervals and the path of the results folder
+come out. The exit status is 0 when every episode has a verdict, 1 when some have none, 2 when the arguments are wrong
+and 130 after Ctrl-C (what was computed is kept, and the command that resumes it is printed).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from vecenv.cli import fail
+from vecenv_eval.cli.options import given_settings, with_settings
+from vecenv_eval.config import ConfigError, EvalConfig, option_name, read_settings, setting
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from vecenv_eval.results import EvalResult, Progress
+    from vecenv_eval.runner import Evaluation
+    from vecenv_eval.store import ResultStore
+
+# Without a terminal, a line is printed each time this share of the episodes has ended.
+_SHARE = 0.1
+
+
+@with_settings
+def eval_command(
+    config: Path | None = typer.Option(
+        None, help="YAML file of settings, by the names of EvalConfig's fields; options override it."
+    ),
+    out: Path | None = typer.Option(None, help="Results folder to make.", show_default="results/TIME_SUITE_POLICY"),
+    resume: Path | None = typer.Option(
+        None, help="Results folder to continue; it keeps its settings.", show_default="none"
+    ),
+    quiet: bool = typer.Option(False, "--quiet", help="Print the path of the results folder and nothing else."),
+    **settings: Any,
+) -> None:
+    """Evaluate a policy on a suite: success rates with Wilson 95 % intervals."""
+    given = given_settings(settings)
+    sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
+    with _user_errors():
+        evaluation, store = _resume(resume, given, config, out) if resume else _start(given, config, out)
+    raise typer.Exit(_run(evaluation, store, quiet))
+
+
+def _start(given: dict[str, Any], file: Path | None, out: Path | None) -> tuple[Evaluation, ResultStore]:
+    """A new evaluation; no folder is made before the settings were checked."""
+    from vecenv_eval.results import begin
+    from vecenv_eval.runner import Evaluation
+    from vecenv_eval.store import RESULTS, default_folder
+
+    given = {**(read_settings(file) if file else {}), **given}
+    if not given.get("suite"):
+        fail("--suite is needed; `vecenv list` names the suites (or --resume continues a results folder)")
+    config = EvalConfig.from_dict(given)
+    evaluation = Evaluation(config)
+    return evaluation, begin(config, out or default_folder(RESULTS, config.suite, config.policy_name))
+
+
+def _resume(folder: Path, given: dict[str, Any], file: Path | None, out: Path | None) -> tuple[Evaluation, ResultStore]:
+    """An evaluation that is continued; what decides its results is in the folder and cannot be given again."""
+    from vecenv_eval.results import resume
+    from vecenv_eval.runner import Evaluation
+
+    refused = [
+        *(option_name(each) for each in fields(EvalConfig) if each.name in given and not setting(each).resumable),
+        *(name for name, value in (("--config", file), ("--out", out)) if value),
+    ]
+    if refused:
+        fail(f"--resume keeps the settings of {folder}: leave out {', '.join(refused)}")
+    config, store = resume(folder, **given)
+    return Evaluation(config), store
+
+
+@contextmanager
+def _user_errors() -> Iterator[None]:
+    """A mistake of the user becomes one line and exit status 2."""
+    from vecenv_eval.episodes import SpecError
+    from vecenv_eval.policies import PolicyError
+    from vecenv_eval.store import StoreError
+
+    try:
+        yield
+    except (ConfigError, PolicyError, SpecError, StoreError) as error:
+        fail(" ".join(str(error).split()))
+
+
+def _run(evaluation: Evaluation, store: ResultStore, quiet: bool) -> int:
+    """Run and print; returns the exit status."""
+    from rich.console import Console
+
+    console = Console(quiet=quiet)
+    with _user_errors(), _progress(console) as on_progress:
+        result = evaluation.run(store, on_progress)
+    _print_result(console, result)
+    typer.echo(result.folder)
+    return 130 if result.interrupted else 0 if result.ok else 1
+
+
+def _print_result(console: Console, result: EvalResult) -> None:
+    from vecenv_eval.report import STAND_INS, closing_line, stand_in_lines, table
+
+    console.print(table(result.summary))
+    console.print(closing_line(result.summary), highlight=False, soft_wrap=True)
+    if result.summary.stand_ins:
+        console.print(f"{STAND_INS}:", style="yellow")
+    for line in stand_in_lines(result.summary):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    for cause in result.causes:
+        console.print(f"error in a batch: {cause}", style="red", markup=False, highlight=False, soft_wrap=True)
+    if not result.ok:
+        again = f"Episodes lack a verdict; to run them: vecenv eval --resume {result.folder}"
+        console.print(again, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[Progress], None]]:
+    """A progress bar on a terminal, a line from time to time elsewhere."""
+    if not console.is_terminal or console.quiet:
+        yield _Lines(console)
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as RichProgress
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with RichProgress(*columns, console=console) as bar:
+        task = bar.add_task("starting", total=None)
+        yield lambda now: bar.update(task, description=_describe(now), total=now.total, completed=now.done + now.errors)
+
+
+class _Lines:
+    """Progress for logs: a line per batch and per tenth of the episodes."""
+
+    def __init__(self, console: Console) -> None:
+        self._console, self._next = console, _SHARE
+
+    def __call__(self, now: Progress) -> None:
+        ended = now.done + now.errors
+        if now.setting_up or ended >= self._next * now.total:
+            self._console.print(f"{ended}/{now.total} episodes, {_describe(now)}", highlight=False)
+            self._next = ended / now.total + _SHARE
+
+
+def _describe(now: Progress) -> str:
+    batch = f"batch {now.batch + 1}/{now.num_batches}"
+    if now.setting_up:
+        return f"{batch}: setting up"
+    problems = "".join(f", {n} {what}" for n, what in ((now.faults, "faulted"), (now.errors, "failed")) if n)
+    speed = now.steps / now.seconds if now.seconds else 0.0
+    return f"{batch}: {now.successes} solved{problems}, {speed:,.0f} steps/s"

@@ -1,0 +1,204 @@
+"""What to evaluate and how: one frozen dataclass, from which the command line and YAML files follow.
+
+Settings come in as keyword arguments, as a mapping (:meth:`EvalConfig.from_dict`), from a YAML file
+(:meth:`EvalConfig.load`) or as options of ``vecenv eval``, which are generated from the fields. To add a setting, add a
+field with its sentence; nothing else has to be changed for it to be an option, to be read and to be written. This
+module imports neither NumPy nor a simulator, because ``vecenv --help`` reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, asdict, dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import vecenv
+from vecenv.errors import InvalidInput
+from vecenv.util.names import unknown
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+ALL = "all"
+# Policies that know a benchmark's scenes, by the family of suites they are made for.
+SCRIPTED = {"libero": "pick_place", "simpler": "simpler_scripted"}
+_KEY = "setting"
+
+
+class ConfigError(InvalidInput):
+    """The evaluation was asked for something that does not exist or does not fit together."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is known about a field of a config beyond its type and default.
+
+    Attributes:
+        help: a sentence about it.
+        default: what the default means, where its value does not say it.
+        minimum: the smallest number allowed.
+        flag: its option on the command line without ``--``, where that is not the field's name.
+        resumable: it may change when a results folder is resumed, because no verdict depends on it.
+    """
+
+    help: str
+    default: str = ""
+    minimum: int | None = None
+    flag: str = ""
+    resumable: bool = False
+
+
+def setting(field: Field[Any]) -> Setting:
+    """The setting behind a field of a config."""
+    return field.metadata[_KEY]
+
+
+def option_name(field: Field[Any]) -> str:
+    """The option of ``vecenv eval`` for a field: ``"--max-steps"``."""
+    return f"--{setting(field).flag or field.name.replace('_', '-')}"
+
+
+def _about(
+    help: str, *, default: str = "", minimum: int | None = None, flag: str = "", resumable: bool = False
+) -> dict[str, Setting]:
+    return {_KEY: Setting(help, default, minimum, flag, resumable)}
+
+
+def default_policy(suite: str) -> str:
+    """The scripted policy that is made for a suite."""
+    return SCRIPTED[vecenv.family(suite)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalConfig:
+    """What to evaluate, and how. The sentence of each field is beside it.
+
+    Raises:
+        ConfigError: a number is below its minimum.
+    """
+
+    # Numbers in YAML may stand for text: ``episodes: 5`` means ``"5"``.
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"coerce_numbers_to_str": True}
+
+    suite: str = field(metadata=_about("Suite to evaluate; `vecenv list` names them.", default="required"))
+    policy: str | None = field(
+        default=None,
+        metadata=_about(
+            "random, zero, voxposer, pick_place (LIBERO), simpler_scripted, or your own module:Class.",
+            default="the suite's scripted one",
+        ),
+    )
+    tasks: str = field(default=ALL, metadata=_about("all, or indices, ranges and names: 0,3,5-7."))
+    episodes: str | Sequence[int] = field(
+        default=ALL, metadata=_about("all (the protocol's), a count, or indices and ranges: 0,3,5-7.")
+    )
+    policy_args: Mapping[str, Any] = field(
+        default_factory=dict, metadata=_about("key=value for the policy; repeatable.", flag="policy-arg")
+    )
+    protocol: str = field(default="seed", metadata=_about("Evaluation protocol; `vecenv list --protocols` has them."))
+    backend: str = field(default="native", metadata=_about("Physics backend."))
+    max_steps: int | None = field(
+        default=None,
+        metadata=_about("Step budget of an episode, control ticks.", default="the protocol's", minimum=1),
+    )
+    seed: int | None = field(default=None, metadata=_about("Seed of environment and policy.", default="the protocol's"))
+    env_args: Mapping[str, Any] = field(
+        default_factory=dict, metadata=_about("key=value for vecenv.make; repeatable.", flag="env-arg")
+    )
+    num_envs: int | None = field(
+        default=None,
+        metadata=_about("Most episodes that run at once.", default="the suite's", minimum=1, resumable=True),
+    )
+    num_threads: int | None = field(
+        default=None,
+        metadata=_about(
+            "Threads of the physics (SIMPLER: processes).", default="the backend's", minimum=1, resumable=True
+        ),
+    )
+    record: bool = field(
+        default=False, metadata=_about("Keep the executed actions, for `vecenv replay`.", resumable=True)
+    )
+    record_states: bool = field(
+        default=False, metadata=_about("Keep the states too; implies --record.", resumable=True)
+    )
+    fail_fast: bool = field(default=False, metadata=_about("Stop at the first batch that raises.", resumable=True))
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value, minimum = getattr(self, each.name), setting(each).minimum
+            if minimum is not None and value is not None and value < minimum:
+                raise ConfigError(f"{each.name} must be at least {minimum}, not {value}")
+
+    @property
+    def policy_name(self) -> str:
+        """The policy to run: the one given, else the suite's scripted one."""
+        return self.policy or default_policy(self.suite)
+
+    @property
+    def records(self) -> bool:
+        """Whether executed actions are kept."""
+        return self.record or self.record_states
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> EvalConfig:
+        """A config from plain values, by field name.
+
+        Raises:
+            ConfigError: there is no such field, a value has the wrong type, or the suite is missing.
+        """
+        from pydantic import TypeAdapter, ValidationError
+
+        names = [each.name for each in fields(cls)]
+        for name in values:
+            if name not in names:
+                raise ConfigError(unknown("setting", str(name), names))
+        try:
+            return TypeAdapter(cls).validate_python(dict(values))
+        except ValidationError as error:
+            raise ConfigError("; ".join(map(_problem, error.errors()))) from None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values by field name, with the policy that is run; :meth:`from_dict` reads them back."""
+        return {**asdict(self), "policy": self.policy_name}
+
+    @classmethod
+    def load(cls, path: Path) -> EvalConfig:
+        """Read a YAML file.
+
+        Raises:
+            ConfigError: it cannot be read, or its settings make no config.
+        """
+        return cls.from_dict(read_settings(path))
+
+    def save(self, path: Path) -> None:
+        """Write a YAML file with every setting; its folder is made."""
+        import yaml
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        values = self.to_dict()
+        if not isinstance(self.episodes, str):
+            values["episodes"] = list(self.episodes)
+        path.write_text(yaml.safe_dump(values, sort_keys=False))
+
+
+def _problem(error: ErrorDetails) -> str:
+    """What pydantic found wrong with one field, or what the config itself raised."""
+    return f"{error['loc'][0]}: {error['msg']}" if error["loc"] else str(error.get("ctx", {})["error"])
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file: some of the settings of a config, unchecked.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds something else.
+    """
+    import yaml
+
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected settings such as `suite: libero_object`, one a line")
+    return values

@@ -1,0 +1,190 @@
+"""Demonstrations read from HDF5 files, published ones and our own.
+
+Files come from anywhere, so nothing in them is trusted (see ``hdf5`` and ``mjcf``). What is wrong with one
+demonstration is reported about that one, and the others can still be used.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from vecenv.assets import AssetsMissing
+from vecenv.contract import ACTION_DIM
+from vecenv.libero.tasks.suites import NUM_EPISODES, TaskSpec, list_suites, list_tasks
+from vecenv.libero.tasks.suites import task as find_spec
+from vecenv_eval.demos.hdf5 import (
+    DAMAGE,
+    DemoError,
+    Errors,
+    Opened,
+    Unreadable,
+    error_reason,
+    json_attribute,
+    member,
+    numeric_dataset,
+    require_finite,
+    shape_text,
+    states_dataset,
+    text_attribute,
+    vector_attribute,
+)
+from vecenv_eval.demos.mjcf import fixture_poses
+from vecenv_eval.demos.options import check_options
+from vecenv_eval.demos.schema import Demo, MadeStart, StoredStart
+
+# Far beyond any demonstration; a file that asks for more is damaged or hostile.
+MAX_TICKS = 100_000
+_NAME = re.compile(r"demo_?(\d+)")
+
+
+def read_demos(path: Path, *, suite: str | None = None, task: int | None = None) -> tuple[list[Demo], list[Unreadable]]:
+    """Read every demonstration of a file.
+
+    Args:
+        path: the file.
+        suite, task: what it demonstrates; by default what the file states, or the task of the same name.
+
+    Returns:
+        The demonstrations in order of their numbers, and those that cannot be used.
+
+    Raises:
+        DemoError: the file as a whole cannot be used.
+    """
+    with Opened(path) as file, Errors(path):
+        data = member(file, "data", h5py.Group)
+        spec = _find_task(path, data, suite, task)
+        names = sorted((name for name in map(str, data) if _NAME.fullmatch(name)), key=_number)
+        if not names:
+            raise DemoError("its group 'data' holds no demonstrations (demo_0, demo_1, ...)")
+        demos, bad = [], []
+        for name in names:
+            try:
+                demos.append(_demo(path, data, name, spec))
+            except AssetsMissing:
+                raise
+            except DAMAGE as error:
+                bad.append(Unreadable(path=path, name=name, reason=error_reason(error)))
+        return demos, bad
+
+
+def _number(name: str) -> tuple[int, str]:
+    return int("".join(filter(str.isdecimal, name))), name
+
+
+def _demo(path: Path, data: h5py.Group, name: str, spec: TaskSpec) -> Demo:
+    group = member(data, name, h5py.Group)
+    actions = _actions(group)
+    if "states" in group:
+        states_dataset(group, len(actions))
+    return Demo(
+        path=path,
+        name=name,
+        suite=spec.suite,
+        task=spec.index,
+        start=_made_start(group) if "make" in group.attrs else _stored_start(group, spec, len(actions)),
+        actions=actions,
+        success=_verdict(group, len(actions)),
+    )
+
+
+def _actions(group: h5py.Group) -> np.ndarray:
+    dataset = numeric_dataset(group, "actions")
+    if dataset.ndim != 2 or dataset.shape[1] != ACTION_DIM or not 1 <= dataset.shape[0] <= MAX_TICKS:
+        raise DemoError(
+            f"actions: expected [T, {ACTION_DIM}] with T from 1 to {MAX_TICKS:,}, got {shape_text(dataset.shape)}"
+        )
+    actions = np.asarray(dataset[()], float)
+    bad = ~np.isfinite(actions).all(axis=1)
+    if bad.any():
+        raise DemoError(f"actions: row {int(bad.argmax())} is not finite")
+    return actions
+
+
+def _verdict(group: h5py.Group, ticks: int) -> bool | None:
+    """Our own ``success``, else the last reward, else the last ``done`` (which is LIBERO's success), else None."""
+    if "success" in group.attrs:
+        value = group.attrs["success"]
+        if not isinstance(value, bool | np.bool_ | np.integer):
+            raise DemoError(f"attribute success: expected true or false, got {value!r:.50}")
+        return bool(value)
+    for name in ("rewards", "dones"):
+        if name in group:
+            dataset = numeric_dataset(group, name)
+            if dataset.shape != (ticks,):
+                raise DemoError(f"{name}: expected one number an action, [{ticks}], got {shape_text(dataset.shape)}")
+            return bool(dataset[ticks - 1] > 0)
+    return None
+
+
+def _stored_start(group: h5py.Group, spec: TaskSpec, ticks: int) -> StoredStart:
+    if "init_state" in group.attrs:
+        name, state = "init_state", vector_attribute(group, "init_state")
+    elif "states" in group:
+        name, state = "states row 0", np.asarray(states_dataset(group, ticks)[0], float)
+    else:
+        raise DemoError("neither the attribute init_state nor states: nothing says where it begins")
+    width = spec.init_states().shape[1]
+    if len(state) != width:
+        raise DemoError(f"{name}: {len(state)} numbers, but a state of {spec.suite} task {spec.index} has {width}")
+    text = text_attribute(group, "model_file")
+    return StoredStart(state=require_finite(name, state), fixtures=None if text is None else fixture_poses(text, spec))
+
+
+def _made_start(group: h5py.Group) -> MadeStart:
+    options = json_attribute(group, "make")
+    check_options(options)
+    episode = group.attrs.get("episode")
+    if not isinstance(episode, int | np.integer) or not 0 <= episode < NUM_EPISODES:
+        raise DemoError(f"attribute episode: expected 0 to {NUM_EPISODES - 1}, got {episode!r:.50}")
+    return MadeStart(episode=int(episode), options=options)
+
+
+def _find_task(path: Path, data: h5py.Group, suite: str | None, task: int | None) -> TaskSpec:
+    """The task asked for; else the one the file names; else the one named as its task file or the file is."""
+    if suite is None and task is None and "suite" in data.attrs:
+        return _named_task(text_attribute(data, "suite"), data.attrs.get("task"))
+    if suite is not None and task is not None:
+        return find_spec(suite, task)
+    files = list(_task_files(path, data))
+    for file in files:
+        for candidate in _suites(suite, file):
+            for spec in list_tasks(candidate):
+                if spec.name == file.stem:
+                    return spec
+    names = ", ".join(repr(file.name) for file in files)
+    where = f"suite {suite}" if suite else "any suite"
+    raise DemoError(
+        f"no task of {where} has the name of its task file ({names:.200}): say which with --suite and --task"
+    )
+
+
+def _named_task(suite: str | None, task: object) -> TaskSpec:
+    if suite not in list_suites():
+        raise DemoError(f"attribute suite: {suite!r:.50} is none of {', '.join(list_suites())}")
+    specs = list_tasks(suite)
+    if not isinstance(task, int | np.integer) or not 0 <= task < len(specs):
+        raise DemoError(f"attribute task: expected 0 to {len(specs) - 1}, got {task!r:.50}")
+    return specs[int(task)]
+
+
+def _task_files(path: Path, data: h5py.Group) -> Iterable[Path]:
+    """Task files a demonstration file may be about, the surest first."""
+    if name := text_attribute(data, "bddl_file_name"):
+        yield Path(name)
+    if "env_args" in data.attrs:
+        name = json_attribute(data, "env_args").get("bddl_file")
+        if isinstance(name, str) and name:
+            yield Path(name)
+    yield Path(path.stem.removesuffix("_demo") + ".bddl")
+
+
+def _suites(suite: str | None, file: Path) -> list[str]:
+    """Suites to look in: the one given, else the one whose folder the task file was in, LIBERO's own, LIBERO-PRO's."""
+    if suite is not None:
+        return [suite]
+    return sorted(list_suites(), key=lambda name: name != file.parent.name)

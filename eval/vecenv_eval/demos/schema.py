@@ -1,0 +1,106 @@
+"""What a demonstration file holds, as dataclasses: demonstrations as they are read, recordings as they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import h5py
+import numpy as np
+
+from vecenv_eval.demos.hdf5 import Errors, Opened, member, require_finite, states_dataset, vector_attribute
+
+SUFFIXES = (".hdf5", ".h5")
+
+# Position [3] in metres and quaternion wxyz [4], world frame.
+Pose: TypeAlias = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredStart:
+    """A demonstration that begins in a stored state.
+
+    Attributes:
+        state: time (seconds), qpos, qvel, float64 [1 + nq + nv].
+        fixtures: name -> (position [3] in metres, quaternion wxyz [4]), world frame; None where the file has no MJCF.
+    """
+
+    state: np.ndarray
+    fixtures: Mapping[str, Pose] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MadeStart:
+    """A demonstration that begins where ``vecenv.make`` puts an episode.
+
+    Attributes:
+        episode: index of the episode.
+        options: keyword arguments of ``vecenv.make``, see ``make_options``.
+    """
+
+    episode: int
+    options: Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """One recorded sequence of actions.
+
+    Attributes:
+        path, name: the file, and the demonstration's name in it.
+        suite, task: what it is a demonstration of.
+        start: where it begins.
+        actions: float64 [T, 7], finite.
+        success: the verdict on record, None where there is none.
+    """
+
+    path: Path
+    name: str
+    suite: str
+    task: int
+    start: StoredStart | MadeStart
+    actions: np.ndarray
+    success: bool | None
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def recorded_state(self, ticks: int) -> np.ndarray | None:
+        """The state on record after so many ticks: time, qpos, qvel, [1 + nq + nv]; None where there is none.
+
+        Raises:
+            DemoError: it is there and cannot be read, or is not finite.
+        """
+        with Opened(self.path) as file, Errors(self.path, self.name):
+            group = member(member(file, "data", h5py.Group), self.name, h5py.Group)
+            if ticks == len(self) and "final_state" in group.attrs:
+                return require_finite("final_state", vector_attribute(group, "final_state"))
+            if "states" not in group or ticks >= len(self):
+                return None
+            return require_finite(f"states row {ticks}", np.asarray(states_dataset(group, len(self))[ticks], float))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """One episode of our own, ready to be written.
+
+    Attributes:
+        episode: index of the episode.
+        success: its verdict.
+        fault: why its physics failed, "" when it did not.
+        actions: what was executed, [T, 7].
+        init_state, final_state: before the first and after the last action, [1 + nq + nv].
+        states: before each action, [T, 1 + nq + nv], or None.
+        options: keyword arguments of ``vecenv.make``, see ``make_options``; plain JSON types.
+    """
+
+    episode: int
+    success: bool
+    fault: str
+    actions: np.ndarray
+    init_state: np.ndarray
+    final_state: np.ndarray
+    states: np.ndarray | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)

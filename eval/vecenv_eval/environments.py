@@ -1,0 +1,109 @@
+"""The environment that runs the batches: built once, re-placed while scenes stay the same, closed at the end.
+
+A :class:`~vecenv_eval.episodes.Batch` comes in; :class:`Placed` goes out: the batch after its reset, and the episode in
+each slot.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vecenv import protocols
+from vecenv.assets import AssetsMissing
+from vecenv.contract import BatchEnv, ResetInfo
+from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.episodes import Batch, Episode, Suite
+from vecenv_eval.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A batch in its environment, just reset.
+
+    Attributes:
+        env: the environment.
+        info: what its reset returned.
+        slots: the episode in each slot.
+        setup_s: seconds that building, placing and resetting took.
+    """
+
+    env: BatchEnv
+    info: ResetInfo
+    slots: Sequence[Episode]
+    setup_s: float
+
+
+class Environments:
+    """Builds and re-places the environment of one run.
+
+    Args:
+        simulator: builds environments.
+        suite: the suite, for which tasks share a scene.
+        config: what ``make`` is called with.
+        on_make: called with each environment that was built.
+    """
+
+    def __init__(
+        self, simulator: Simulator, suite: Suite, config: EvalConfig, on_make: Callable[[BatchEnv], None]
+    ) -> None:
+        self._simulator, self._suite, self._config, self._on_make = simulator, suite, config, on_make
+        self._env: BatchEnv | None = None
+        self._layout: tuple[Hashable, ...] = ()
+
+    def place(self, batch: Batch) -> Placed:
+        """Place a batch and reset it; an environment is built only when a slot needs another scene.
+
+        Raises:
+            ConfigError: the environment refuses a setting, or assets are missing.
+            RuntimeError: it placed other episodes than were asked for.
+        """
+        started = time.perf_counter()
+        layout = tuple(self._suite.scenes[slot.task] for slot in batch.slots)
+        if self._env is not None and layout == self._layout:
+            self._env.set_episodes(tasks=[s.task for s in batch.slots], episodes=[s.episode for s in batch.slots])
+        else:
+            self.close()
+            self._env, self._layout = self._make(batch), layout
+            self._on_make(self._env)
+        info = self._env.reset()
+        return Placed(self._env, info, _slots(info, batch), time.perf_counter() - started)
+
+    def close(self) -> None:
+        """Close the environment in use, if there is one."""
+        env, self._env, self._layout = self._env, None, ()
+        if env is not None:
+            env.close()
+
+    def _make(self, batch: Batch) -> BatchEnv:
+        """Build an environment. A value it refuses is the config's fault: no other batch would fare better."""
+        arguments = {"tasks": list(batch.tasks), "episodes": list(batch.episodes), **make_arguments(self._config)}
+        try:
+            return self._simulator.make(batch.suite, **arguments)
+        except AssetsMissing as error:
+            raise ConfigError(str(error)) from error
+        except (ValueError, KeyError, ImportError) as error:
+            # A bare KeyError or ImportError is an accident; a library that refuses a value raises its own subclass.
+            if type(error) in (KeyError, ImportError, ModuleNotFoundError):
+                raise
+            raise ConfigError(f"{type(error).__name__}: {error}") from error
+
+
+def make_arguments(config: EvalConfig) -> dict[str, Any]:
+    """Keyword arguments of ``make`` for every batch, without tasks and episodes."""
+    arguments = {"backend": config.backend, "num_threads": config.num_threads, **config.env_args}
+    given: dict[str, Any] = {"seed": config.seed, "max_steps": config.max_steps}
+    if config.protocol != protocols.DEFAULT:
+        given["protocol"] = config.protocol
+    return {**arguments, **{name: value for name, value in given.items() if value is not None}}
+
+
+def _slots(info: ResetInfo, batch: Batch) -> list[Episode]:
+    """The episode in each slot, as the environment reports it; together they must be the batch asked for."""
+    numbers = [int(text.rsplit("/", 1)[1]) for text in info.episode_id]
+    slots = [Episode(info.suite, int(task), number) for task, number in zip(info.task_id, numbers, strict=True)]
+    if sorted(slots) != sorted(batch.slots):
+        raise RuntimeError(f"the environment placed {len(slots)} other episodes than the {len(batch)} asked for")
+    return slots

@@ -1,0 +1,104 @@
+"""How an evaluation stands and how it ended, and the results folders that a config begins or resumes.
+
+Records come in as episodes end; :class:`Progress` goes to whoever watches, :class:`EvalResult` to the caller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.report import Summary
+from vecenv_eval.store import CONFIG, Record, ResultStore, StoreError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Where an evaluation stands; handed to ``on_progress`` after every call of the policy.
+
+    Attributes:
+        total: episodes asked for.
+        done: episodes with a verdict, those of earlier runs included.
+        successes, faults, errors: among the episodes so far.
+        steps: control ticks executed in this run, summed over slots.
+        seconds: seconds this run has spent running episodes.
+        batch, num_batches: which batch is running.
+        setting_up: the batch is being placed.
+    """
+
+    total: int
+    done: int
+    successes: int
+    faults: int
+    errors: int
+    steps: int
+    seconds: float
+    batch: int
+    num_batches: int
+    setting_up: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalResult:
+    """How an evaluation ended.
+
+    Attributes:
+        summary: the numbers, also in ``summary.json``.
+        records: the record of each episode that ran.
+        folder: the results folder.
+        interrupted: it was stopped from the keyboard.
+        causes: what the failed batches of this run raised, without repetition.
+    """
+
+    summary: Summary
+    records: tuple[Record, ...]
+    folder: Path
+    interrupted: bool
+    causes: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Every episode has a verdict."""
+        return self.summary.complete and not self.interrupted
+
+
+def begin(config: EvalConfig, folder: Path) -> ResultStore:
+    """Open a new results folder for a config.
+
+    Raises:
+        StoreError: something is in the way.
+    """
+    return ResultStore.create(folder, {"config": config.to_dict(), "runs": []})
+
+
+def resume(folder: Path, **changes: Any) -> tuple[EvalConfig, ResultStore]:
+    """Open an existing results folder, to run what is missing.
+
+    Args:
+        folder: the results folder.
+        **changes: fields of ``EvalConfig`` to replace for this run; those that are None stay as they were.
+
+    Raises:
+        StoreError: it is not a results folder, or it was written by something else.
+    """
+    store = ResultStore.open(folder)
+    try:
+        config = EvalConfig.from_dict(store.config()["config"])
+    except (KeyError, TypeError, AttributeError, ConfigError) as error:
+        raise StoreError(f"{folder / CONFIG} does not hold an evaluation: {error}") from None
+    return replace(config, **{key: value for key, value in changes.items() if value is not None}), store
+
+
+def count(records: Iterable[Record]) -> dict[str, int]:
+    """The counts of :class:`Progress` among records: done, successes, faults and errors."""
+    records = list(records)
+    errors = sum(bool(record.error) for record in records)
+    return {
+        "done": len(records) - errors,
+        "successes": sum(record.success for record in records),
+        "faults": sum(bool(record.fault) for record in records),
+        "errors": errors,
+    }

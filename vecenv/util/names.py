@@ -1,0 +1,18 @@
+"""Names that a user got wrong: what to say, and which known names come close."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection
+
+
+def unknown(what: str, given: str, known: Collection[str]) -> str:
+    """Say that a name is not known, and which known names come close (all of them when none does).
+
+    Args:
+        what: kind of name, such as ``"suite"``.
+        given: the name that is not known.
+        known: the names that are.
+    """
+    close = difflib.get_close_matches(given, known, n=3) or known
+    return f"unknown {what} {given!r}: did you mean {', '.join(close)}?"
