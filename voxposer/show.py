@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from voxposer.agent import Agent, AgentConfig, Planned
+from voxposer.agent import Agent, AgentConfig, PlannedMotion
 from voxposer.language.llm import Llm, LlmConfig
-from voxposer.language.lmp import Call
-from voxposer.steps import obstacle_map
+from voxposer.language.lmp_config import Call
+from voxposer.paths import obstacle_map
 
 # Voxels of an obstacle map above this are drawn, and no more than that many.
 _DRAWN_ABOVE = 0.3
@@ -51,7 +51,7 @@ class Shown:
     instruction: str
     model: str
     subtasks: tuple[str, ...]
-    motions: tuple[Planned, ...]
+    motions: tuple[PlannedMotion, ...]
     calls: tuple[Call, ...]
     success: bool
     ticks: int
@@ -85,7 +85,7 @@ def look_at(
     import vecenv
 
     env = vecenv.make(suite, task=task, episodes=[episode])
-    motions: list[Planned] = []
+    motions: list[PlannedMotion] = []
     try:
         info = env.reset()
         prompts = str(prompts_dir) if prompts_dir else None
@@ -99,7 +99,7 @@ def look_at(
             title=info.episode_id[0],
             instruction=slot.instruction,
             model=model,
-            subtasks=slot.subtasks,
+            subtasks=slot.progress.subtasks,
             motions=tuple(motions),
             calls=tuple(slot.lmps.trace),
             success=bool(control.success[0]),
@@ -156,14 +156,14 @@ def _call_section(call: Call) -> str:
     )
 
 
-def _motion_section(number: int, motion: Planned) -> str:
+def _motion_section(number: int, motion: PlannedMotion) -> str:
     kinds = {"home": "back to where it began", "stay": "where it is", "path": "over maps"}
     words = f"{number}. {motion.text} ({kinds[motion.request.kind]})"
     picture = figure(motion).to_html(full_html=False, include_plotlyjs=False, default_height="520px")
     return f"<h3>{html.escape(words)}</h3>{picture}"
 
 
-def figure(motion: Planned) -> Any:
+def figure(motion: PlannedMotion) -> Any:
     """One motion as a plotly figure."""
     import plotly.graph_objects as go
 
@@ -192,7 +192,7 @@ def _cloud(go: Any, name: str, points: np.ndarray, size: int, colour: str, opaci
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker)
 
 
-def layers(motion: Planned) -> dict[str, np.ndarray]:
+def layers(motion: PlannedMotion) -> dict[str, np.ndarray]:
     """What there is to see of a motion: name -> points [n, 3], metres, world frame; none where there is nothing."""
     perception, request = motion.perception, motion.request
     grid = perception.grid
@@ -210,7 +210,7 @@ def layers(motion: Planned) -> dict[str, np.ndarray]:
     }
 
 
-def _kept_away(motion: Planned) -> np.ndarray:
+def _kept_away(motion: PlannedMotion) -> np.ndarray:
     """Middles of the voxels that the planner kept away from."""
     cost = obstacle_map(motion.perception, motion.request, AgentConfig().route)
     voxels = np.argwhere(cost > _DRAWN_ABOVE)
@@ -235,7 +235,7 @@ def save_picture(shown: Shown, path: Path) -> None:
     sheet.savefig(path, dpi=110)
 
 
-def _draw(axes: Any, motion: Planned) -> None:
+def _draw(axes: Any, motion: PlannedMotion) -> None:
     found = layers(motion)
     axes.set_title(motion.text, fontsize=8)
     way = np.concatenate([found["targets"], found["hand's way"]])

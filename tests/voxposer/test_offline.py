@@ -13,7 +13,8 @@ import pytest
 from support.offline_world import ToyWorld
 
 from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud
-from voxposer.language.lmp import DynamicObservations, load_prompts
+from voxposer.language.observations import DynamicObservations
+from voxposer.language.prompts import load_prompts
 from voxposer.offline import writer as offline
 from voxposer.offline.composer import write_composer
 from voxposer.offline.grammar import read_instruction, read_noun

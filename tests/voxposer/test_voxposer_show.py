@@ -12,13 +12,13 @@ pytest.importorskip("plotly")
 from support.voxposer_world import Obedient, box, snapshot
 from test_voxposer_agent import agent
 
-from voxposer.agent import Planned
-from voxposer.language.lmp import Call
+from voxposer.agent import PlannedMotion
+from voxposer.language.lmp_config import Call
 from voxposer.show import Shown, layers, parse_task, render_page, save_picture
 
 
-def planned() -> list[Planned]:
-    motions: list[Planned] = []
+def planned() -> list[PlannedMotion]:
+    motions: list[PlannedMotion] = []
     acting, _ = agent(Obedient(snapshot({"cube_1": box((0.02, 0.02, 0.02), (0.2, 0.1, 0.02))})), ("lift",))
     acting._on_planned = motions.append
     acting.step()

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vecenv.manipulation.world import World, around
+from vecenv.manipulation.world import SceneGeometry, around
 
 # Hands whose axis has at most this vertical component point down.
 _UPRIGHT = -0.98
@@ -71,7 +71,9 @@ class Stop:
     final: bool = False
 
 
-def works(start: np.ndarray, goal: np.ndarray, *, closed: bool, held: str, attached: str, config: RouteConfig) -> bool:
+def is_contact_move(
+    start: np.ndarray, goal: np.ndarray, *, closed: bool, held: str, attached: str, config: RouteConfig
+) -> bool:
     """Whether a motion is meant to touch: the hand is closed on a fixture, or closed, empty, and moves about level."""
     if not closed or held:
         return False
@@ -88,7 +90,7 @@ def work_route(stops: Sequence[Stop], config: RouteConfig = RouteConfig()) -> li
 
 
 def travel_route(
-    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: World, held: str, config: RouteConfig
+    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: SceneGeometry, held: str, config: RouteConfig
 ) -> list[Stop]:
     """A path raised over the scene.
 
@@ -110,7 +112,7 @@ def travel_route(
 
 
 def _raised(
-    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: World, held: str, config: RouteConfig
+    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: SceneGeometry, held: str, config: RouteConfig
 ) -> list[Stop]:
     """The way of a hand over which nothing hangs at its start."""
     start, goal = stops[0], stops[-1]
@@ -128,7 +130,7 @@ def _raised(
     return [whole[i] for i in keep]
 
 
-def _from_under(world: World, held: str, hand: np.ndarray) -> np.ndarray:
+def _from_under(world: SceneGeometry, held: str, hand: np.ndarray) -> np.ndarray:
     """The shortest level move [3] after which what is held can go straight up; zero if it can, or if there is none."""
     thing = world.points(held)[::2] - world.hand + hand
     near = np.concatenate([world.others(held), world.walls])
@@ -184,18 +186,18 @@ def _at(pos: np.ndarray, height: float) -> np.ndarray:
     return np.array([pos[0], pos[1], max(height, float(pos[2]))])
 
 
-def _crowded(world: World, hand: np.ndarray, held: str, config: RouteConfig) -> bool:
+def _crowded(world: SceneGeometry, hand: np.ndarray, held: str, config: RouteConfig) -> bool:
     """Whether something is within the hand's reach."""
     return bool((np.linalg.norm(world.others(held) - hand, axis=1) < config.approach).any())
 
 
-def _hangs(world: World, hand: np.ndarray, held: str) -> float:
+def _hangs(world: SceneGeometry, hand: np.ndarray, held: str) -> float:
     """How far the lowest of the hand and what it holds is below the grip site."""
     tip = world.config.gripper.tip
     return max(tip, float(world.hand[2] - world.points(held)[:, 2].min())) if held else tip
 
 
-def _tallest(world: World, path: np.ndarray, held: str, config: RouteConfig) -> float:
+def _tallest(world: SceneGeometry, path: np.ndarray, held: str, config: RouteConfig) -> float:
     """Height of the tallest thing within the corridor around a path, [P, 3]."""
     points = world.others(held)
     highest = -np.inf

@@ -1,8 +1,8 @@
-"""One snapshot as planning looks at it: what is where, how high, and which way hands can point.
+"""Geometry of one snapshot for planning: where objects are, how high they are, and rotations of hands.
 
-An :class:`~vecenv.contract.ObjectsSnapshot` comes in; :class:`World` answers what grasping, placing and moving ask of
-it (points of things and of everything else, the ground, the tallest thing on a way). Hands are rotation matrices whose
-third column points out of the palm and whose second is the closing direction.
+An :class:`~vecenv.contract.ObjectsSnapshot` comes in; :class:`SceneGeometry` answers the questions of grasping, placing
+and moving (points of objects and of everything else, the ground, the tallest point along a line). Hands are rotation
+matrices whose third column points out of the palm and whose second is the closing direction.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Margins:
     retreat: float = 0.08
 
 
-class World:
+class SceneGeometry:
     """One snapshot, as planning looks at it.
 
     Args:

@@ -22,7 +22,7 @@ import numpy as np
 
 from vecenv.util.cores import usable_cores
 from voxposer.planning import maps
-from voxposer.planning.planner import Fault, PlannerConfig, neighbour_offsets
+from voxposer.planning.config import Fault, PlannerConfig, neighbour_offsets
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
 # What only compiled code calls needs no entry from Python or C; called from Python nevertheless, it crashes.

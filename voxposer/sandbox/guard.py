@@ -31,7 +31,7 @@ class Refusal(Exception):
     """A program asked for something it may not have.
 
     Attributes:
-        rule: short name of the rule, one of ``voxposer.sandbox.RULES``.
+        rule: short name of the rule, one of ``voxposer.sandbox.syntax.RULES``.
         reason: what was asked and what would be right.
     """
 
