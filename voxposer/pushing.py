@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
+from vecenv.errors import VecenvError
 from vecenv.manipulation.routes import Stop
 from voxposer.perception.view import Perception
 from voxposer.planning.push import Push, PushConfig, best_push, push_waypoints
@@ -21,29 +22,29 @@ from voxposer.planning.push import Push, PushConfig, best_push, push_waypoints
 CHUNK = 8
 
 
-class PushError(RuntimeError):
-    """A thing cannot be pushed where it should go."""
+class PushError(VecenvError, RuntimeError):
+    """An object cannot be pushed where it should go."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PushingConfig:
-    """How things are pushed. Metres unless noted.
+    """How objects are pushed. Metres unless noted.
 
     Attributes:
-        push: of the search, and of the motion where there is ample room.
-        starts: how far before the contact a push may start, and the slant of the fingers, radians, best first. Where
-            what is behind leaves no room, the hand leans over the thing and its fingers reach behind it.
-        near: a thing this close to the end of its way has arrived.
-        most: pushes for one way at most.
+        push: options of the search, and of the motion where there is ample room.
+        starts: distance before the contact at which a push may start, and the slant of the fingers, radians, best
+            first. Where the scene behind leaves no room, the hand leans over the object and reaches behind it.
+        near: an object this close to the end of its path has arrived.
+        most: largest number of pushes for one path.
         over_ground: the grip site stays this far above the table.
-        reach: horizontally from the robot's base, of a hand that points down.
-        slanted_reach: less reach of a hand whose fingers lie level.
-        moved: a thing that moved less than this was pushed in vain.
-        elsewhere: another push touches at least this far from where one was in vain.
-        detour: how far a thing is pushed aside that cannot be pushed along its way.
-        detours: angles between that and the straight way, tried in turn to either side, radians.
-        facing: cosine between a face and the push against it, at least.
-        room: that the hand needs around it where a push starts.
+        reach: horizontal distance from the robot's base that a hand pointing down can reach.
+        slanted_reach: reduction of the reach for a hand whose fingers are level.
+        moved: a push that moved the object less than this has failed.
+        elsewhere: the next push touches at least this far from a failed one.
+        detour: how far an object is pushed aside that cannot be pushed along its path.
+        detours: angles between that and the straight line, tried in turn to either side, radians.
+        facing: smallest cosine between a face and the push against it.
+        room: room that the hand needs around it where a push starts.
         body: the closed hand in its own frame (x, y across the fingers, z out of them), lower and upper corners of the
             fingers, the palm, and the wrist, which reaches to either side.
     """
@@ -79,15 +80,15 @@ class PushingConfig:
 
 @dataclass
 class PushTask:
-    """A thing on its way.
+    """An object that is pushed along a path.
 
     Attributes:
-        name: of the thing.
-        way: places for its centre, world frame, [P, 3]; the last is where it shall be.
-        cursor: the next of them.
-        pushes: how many there were.
-        begun: where the thing's centre was and where the hand was to touch it in the latest push, [3] each.
-        vain: such touches of pushes that did not move it, relative to its centre, [3] each.
+        name: of the object.
+        way: waypoints of its centre, world frame, metres, [P, 3]; the last is the goal.
+        cursor: index of the next waypoint.
+        pushes: number of pushes so far.
+        begun: the object's centre before the latest push and the contact of that push, [3] each.
+        failed: contacts of pushes that did not move it, relative to its centre, [3] each.
     """
 
     name: str
@@ -95,11 +96,11 @@ class PushTask:
     cursor: int = 0
     pushes: int = 0
     begun: tuple[np.ndarray, np.ndarray] | None = None
-    vain: list[np.ndarray] = field(default_factory=list)
+    failed: list[np.ndarray] = field(default_factory=list)
 
 
 def arrived(task: PushTask, perception: Perception, config: PushingConfig = PushingConfig()) -> bool:
-    """Whether the thing is where it shall be, or has been pushed often enough; places behind it are passed over."""
+    """Whether the object is at its goal, or was pushed often enough; waypoints that it has passed are skipped."""
     centre = perception.snapshot.objects[task.name].points.mean(axis=0)
     _learn(task, centre, config)
     left = (task.way[-1] - centre)[:2]
@@ -112,28 +113,28 @@ def arrived(task: PushTask, perception: Perception, config: PushingConfig = Push
 
 
 def _learn(task: PushTask, centre: np.ndarray, config: PushingConfig) -> None:
-    """Remember a push in vain, so that the next one is another: from elsewhere, or as far as to where there is room."""
+    """Record a failed push, so that the next one differs: another contact, or an earlier waypoint."""
     if task.begun is None:
         return
     before, contact = task.begun
     task.begun = None
     if np.linalg.norm((centre - before)[:2]) < config.moved:
-        task.vain.append(contact - before)
+        task.failed.append(contact - before)
         task.cursor = max(task.cursor - 1, 0)
     else:
-        task.vain.clear()
+        task.failed.clear()
 
 
 @dataclass(frozen=True)
 class PushSituation:
-    """What is known before a push is searched for.
+    """The input of the search for a push.
 
     Attributes:
-        pushing: what is pushed where.
+        task: the object and its path.
         perception: the present snapshot.
         lowest: height below which the grip site must not go, metres.
-        free: points that the hand has room to push at, bool [M].
-        goal: where to push the centre now, [3].
+        free: points at which the hand has room to push, bool [M].
+        goal: where to push the centre, [3].
     """
 
     task: PushTask
@@ -144,9 +145,9 @@ class PushSituation:
 
 
 def situation(task: PushTask, perception: Perception, config: PushingConfig) -> PushSituation:
-    """Where a thing can be pushed: to the next place of its way, else to the first later one, else to one side.
+    """Where an object can be pushed: to its next waypoint, else to the first later one, else to one side.
 
-    The cursor moves along to a place of the way.
+    The cursor of the task moves to the waypoint that is chosen.
 
     Raises:
         PushError: the hand has no room to begin any push.
@@ -167,7 +168,7 @@ def situation(task: PushTask, perception: Perception, config: PushingConfig) -> 
 
 
 def _detours(centre: np.ndarray, end: np.ndarray, config: PushingConfig) -> list[np.ndarray]:
-    """Places beside the straight way, those that lead away from it least first, [3] each."""
+    """Goals beside the straight line, those that deviate least first, [3] each."""
     ahead = (end - centre) * [1.0, 1.0, 0.0]
     ahead /= max(float(np.linalg.norm(ahead)), 1e-6)
     aside = np.array([-ahead[1], ahead[0], 0.0])
@@ -235,7 +236,7 @@ def _touchable(
     met = cloud.points[rows] - _reach_back(cloud.points, rows, ahead, lowest, config)[:, None] * ahead
     name = task.name
     room = np.any([_fits(perception, name, met, ahead, lowest, start, config) for start in config.starts], axis=0)
-    for place in task.vain:
+    for place in task.failed:
         room &= np.linalg.norm((met - cloud.points.mean(axis=0) - place)[:, :2], axis=1) > config.elsewhere
     touchable[rows] = room
     return touchable

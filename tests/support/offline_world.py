@@ -20,8 +20,8 @@ from voxposer.language.llm import LlmConfig
 from voxposer.language.lmp import build_lmps
 from voxposer.language.observations import DynamicObservation, LazyMap, Observation
 from voxposer.language.replies import Reply, ReplyError
-from voxposer.offline import writer as offline
-from voxposer.offline.words import NotUnderstood
+from voxposer.offline import provider as offline
+from voxposer.offline.names import NotUnderstood
 
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])
 

@@ -11,8 +11,8 @@ import pytest
 
 from voxposer.language.lmp_config import CONFIGS
 from voxposer.language.prompts import load_prompts
-from voxposer.offline import writer as offline
-from voxposer.offline.words import NotUnderstood
+from voxposer.offline import provider as offline
+from voxposer.offline.names import NotUnderstood
 from voxposer.sandbox.interpreter import parse
 
 PROMPTS = load_prompts()

@@ -368,7 +368,7 @@ def test_a_push_in_vain_is_not_repeated() -> None:
     before = situation(pushing, plate(), PushingConfig())
     next_pushes([before], PushingConfig())
     assert not arrived(pushing, plate(0.002))  # it hardly moved
-    (vain,) = pushing.vain
+    (vain,) = pushing.failed
     again = situation(pushing, plate(0.002), PushingConfig())
     touched = plate().snapshot.objects["plate_1"].points
     near = np.linalg.norm((touched - vain)[:, :2], axis=1) < 0.02
@@ -376,7 +376,7 @@ def test_a_push_in_vain_is_not_repeated() -> None:
     assert not again.free[near].any()
     next_pushes([again], PushingConfig())
     assert not arrived(pushing, plate(0.05))
-    assert pushing.vain == []
+    assert pushing.failed == []
 
 
 def test_a_thing_against_a_wall_is_pushed_aside_first() -> None:

@@ -14,7 +14,7 @@ import vecenv
 from vecenv.manipulation.world import HOME_ROTATION, SceneGeometry, matrix
 from voxposer import simpler_scene
 from voxposer.agent import AgentConfig
-from voxposer.offline.planner import write_planner
+from voxposer.offline.planner_writer import write_planner
 from voxposer.simpler_scene import NoHandView, hand_poses, hands, tool_poses
 
 pytest.importorskip("sapien")

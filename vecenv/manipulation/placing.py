@@ -1,7 +1,7 @@
 """Grasping an object among its neighbours, and putting it down: candidate poses, their cost, and the height of rest.
 
-A :class:`~vecenv.manipulation.world.SceneGeometry` whose hand holds an object and a :class:`Target` come in; the pose of
-the hand at which it releases the object comes out (:func:`put_down`). Heights come from surface points of the object,
+A :class:`~vecenv.manipulation.world.SceneGeometry` whose hand holds an object and a :class:`Target` come in; the pose
+of the hand at the release comes out (:func:`put_down`). Heights come from surface points of the object,
 of what it will rest on, and of what the open hand must not touch. :func:`choose_grasp` gives the grasp at the start of
 a transfer.
 """

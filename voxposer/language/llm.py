@@ -26,7 +26,7 @@ from typing import Any
 from voxposer.language import providers
 from voxposer.language.replies import LlmError, Message, Reply, ReplyError, Usage
 from voxposer.language.reply_cache import cache_at
-from voxposer.offline.writer import register
+from voxposer.offline.provider import register
 
 OFFLINE = "offline/"
 # Layout of requests and replies on disk; raised when it changes.
