@@ -88,7 +88,7 @@ def obstacle_map(perception: Perception, request: MotionRequest, route: RouteCon
         if request.occupancy is not None
         else {"start": perception.grid.voxel(perception.ee.pos)}
     )
-    return np.asarray(maps.preprocess_avoidance(avoidance, occupied, request.targets, **near))
+    return np.asarray(maps.preprocess_avoidance(avoidance, occupied, np.asarray(request.targets), **near))
 
 
 def scene_occupancy(perception: Perception, moving: str) -> np.ndarray:

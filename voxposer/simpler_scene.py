@@ -162,7 +162,9 @@ class HandView:
 
     def step_waypoints(self, plan: SubtaskPlan, max_misses: int | None = None) -> PlanControl:
         """Follow a plan of the hand."""
-        control = self.env.step_waypoints(plan._replace(poses=tool_poses(plan.poses)), max_misses=max_misses)
+        control = self.env.step_waypoints(
+            plan._replace(poses=tool_poses(np.asarray(plan.poses))), max_misses=max_misses
+        )
         return replace(control, final_pose=hand_poses(control.final_pose))
 
     def observe_objects(self, points: str = "surface") -> Objects:

@@ -19,6 +19,8 @@ from voxposer.planning import planner
 from voxposer.planning.config import Fault, PlannerConfig
 from voxposer.planning.planner import Paths, optimize_paths
 
+pytestmark = pytest.mark.usefixtures("explicit_ranks")
+
 Engine = Literal["jax", "numba"]
 ENGINES: tuple[Engine, ...] = ("jax", "numba")
 DEFAULT = PlannerConfig()

@@ -1,8 +1,8 @@
 """Programs of parse_query_obj: a phrase for an object becomes a program that detects it.
 
 A phrase and the entity names of the scene come in; the program goes out. An object that the words determine is looked
-up by name; otherwise ("the black bowl between the plate and the ramekin") the program compares positions when it runs. The
-writer itself never sees a position.
+up by name; otherwise ("the black bowl between the plate and the ramekin") the program compares positions at run time.
+The writer itself never sees a position.
 """
 
 from __future__ import annotations

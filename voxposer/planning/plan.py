@@ -1,3 +1,4 @@
+# ruff: noqa: F722  (shapes in annotations)
 """Plans of a batch of hands, as tensors that ``env.step_waypoints`` executes in one call.
 
 :class:`Stop` s of each slot come in (``vecenv.manipulation.routes``); a :class:`SubtaskPlan` goes out, a pytree of
@@ -10,12 +11,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Array, Bool, Int, Num
 
 from vecenv.manipulation.routes import Stop
 
+AnyArray = Array | np.ndarray
 # Ticks that fingers get to open or to close.
 HOLD_TICKS = 60
 
@@ -63,12 +66,12 @@ class SubtaskPlan(NamedTuple):
         velocity: share of full speed that the velocity map asks for, [B, T].
     """
 
-    poses: Any
-    grip: Any
-    hold: Any
-    valid: Any
-    subtask: Any
-    velocity: Any
+    poses: Num[AnyArray, "B T 7"]
+    grip: Num[AnyArray, "B T"]
+    hold: Int[AnyArray, "B T"]
+    valid: Bool[AnyArray, "B T"]
+    subtask: Int[AnyArray, "B T"]
+    velocity: Num[AnyArray, "B T"]
 
 
 def expand_flips(
@@ -128,7 +131,7 @@ def stack(rows: Sequence[Sequence[PlannedWaypoint]], config: PlanConfig = PlanCo
     return plan
 
 
-def remaining(plan: SubtaskPlan, ticks: np.ndarray) -> SubtaskPlan:
+def remaining(plan: SubtaskPlan, ticks: Int[np.ndarray, "B T"]) -> SubtaskPlan:
     """What is left of a plan that some slots gave up on.
 
     A slot gives up after several waypoints in a row that it could not reach. It goes on where the grip changes next:
