@@ -1,10 +1,9 @@
-"""The functions that language programs call: they look at one frozen snapshot and ask for motions, and move nothing.
+"""The functions that language programs call: they read one frozen snapshot and ask for motions.
 
-A :class:`~voxposer.perception.Perception` comes in with each subtask (:meth:`Interface.begin`). What programs ask for
-is collected as :class:`Request` s, in order; several of one subtask are to be done one after the other. Planning them
-for a whole batch and following the plans is the agent's business (``voxposer.agent``), so nothing that a program does
-can move a robot. Names, arguments and defaults are upstream's (huangwl18/VoxPoser, ``interfaces.py``), a few are
-added.
+A :class:`~voxposer.perception.view.Perception` comes in with each subtask (:meth:`Interface.begin`). The motions that
+programs ask for are collected as :class:`~voxposer.requests.MotionRequest` s, in order; those of one subtask are
+executed one after the other. ``voxposer.agent`` plans and executes them, so no program moves a robot itself. Names,
+arguments and defaults are upstream's (huangwl18/VoxPoser, ``interfaces.py``), with a few additions.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from voxposer.requests import InterfaceError, MotionRequest
 
 
 class Interface:
-    """What the programs of one slot call.
+    """The functions of one slot's programs.
 
     Attributes:
-        requests: what was asked for in this subtask so far.
+        requests: motions that were asked for in this subtask so far.
     """
 
     def __init__(self) -> None:
@@ -34,22 +33,22 @@ class Interface:
         self.requests: list[MotionRequest] = []
 
     def begin(self, perception: Perception) -> None:
-        """Start a subtask with a fresh snapshot and nothing asked for."""
+        """Start a subtask with a fresh snapshot and no motions."""
         self._perception, self._closed = perception, perception.hand.closed
         self.requests = []
 
     def taken(self) -> list[MotionRequest]:
-        """What was asked for since the last call; its maps are large and no longer kept here."""
+        """The motions asked for since the last call; their maps, which are large, are released here."""
         requests, self.requests = self.requests, []
         return requests
 
     def end(self) -> None:
-        """Let go of snapshot and maps."""
+        """Release the snapshot and the maps."""
         self._perception, self.requests = None, []
 
     @property
     def perception(self) -> Perception:
-        """What is seen now."""
+        """The view of the present snapshot."""
         if self._perception is None:
             raise InterfaceError("no snapshot yet: call begin() first")
         return self._perception
@@ -68,7 +67,7 @@ class Interface:
     # -- looking -------------------------------------------------------------------------------------------------------
 
     def detect(self, name: str) -> LazyObservation:
-        """Observation of a thing, a part, or one of the aliases of hand and table."""
+        """Observation of an object, a part, or one of the aliases of hand and table."""
         return self.perception.detect(name)
 
     def get_ee_pos(self) -> np.ndarray:
@@ -154,7 +153,7 @@ class Interface:
         if targets is not None and not targets.any():
             raise InterfaceError("the affordance map has no target: no voxel is 1")
         if targets is None and object_centric:
-            raise InterfaceError(f"{name} shall move, but there is no affordance map to say where to")
+            raise InterfaceError(f"{name} is to move, but there is no affordance map with its target")
         if object_centric and name not in self.perception.snapshot.movable:
             raise InterfaceError(f"{name} cannot be pushed: it is fixed")
         request = MotionRequest(
@@ -184,7 +183,7 @@ class Interface:
         self.perception.move_hand(home[:3], matrix(home[3:]))
 
     def _advance_hand(self, request: MotionRequest) -> None:
-        """Let the hand count as being at the end of what was asked for: at the nearest target."""
+        """Take the hand to be at the end of a motion, at the nearest target."""
         here = self.perception.grid.voxel(self.perception.ee.pos)
         end, pos = here, self.perception.ee.pos
         if request.targets is not None:

@@ -16,7 +16,7 @@ _GRIP_REACH = 3.0
 
 
 class InterfaceError(InvalidInput):
-    """A program called a function with something that makes no sense; the message says what would."""
+    """A program called a function with invalid arguments; the message says what is expected."""
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,12 @@ class MotionRequest:
 
     Attributes:
         kind: ``"path"`` (plan over maps), ``"stay"`` (no affordance: where the hand is) or ``"home"``.
-        movable: name of what shall move.
-        object_centric: it is a thing, to be pushed, and not the hand.
+        movable: name of what is to be moved.
+        object_centric: whether that is an object, to be pushed, and not the hand.
         start: voxel from which to plan, [3].
         targets: bool [N, N, N]; None for ``stay`` and ``home``.
-        avoidance: float32 [N, N, N] in 0..1, None where the program gave none.
-        occupancy: of the thing to be pushed, bool [N, N, N].
+        avoidance: float32 [N, N, N] in 0..1, None without.
+        occupancy: of the object to be pushed, bool [N, N, N].
         rotation: wxyz, [4] where it is the same everywhere, else [N, N, N, 4]; likewise the next two.
         velocity: share of full speed, [] or [N, N, N].
         gripper: 1 open, 0 closed, [] or [N, N, N].
@@ -60,13 +60,13 @@ class MotionRequest:
         return float(self.velocity if self.velocity.ndim == 0 else self.velocity[tuple(voxel)])
 
     def closed_at(self, voxel: np.ndarray) -> bool:
-        """Whether the grip shall be closed at a voxel."""
+        """Whether the grip is to be closed at a voxel."""
         return float(self.gripper if self.gripper.ndim == 0 else self.gripper[tuple(voxel)]) < 0.5
 
     def closed_at_end(self, voxel: np.ndarray) -> bool:
-        """Whether it shall be closed at the end of the path.
+        """Whether it is to be closed at the end of the path.
 
-        Programs mark the few voxels where the grip shall change, and a path may end beside them: the rarer of the two
+        Programs mark the few voxels where the grip changes, and a path may end beside them: the rarer of the two
         values counts if it is within 3 voxels (upstream's ``_path2traj``).
         """
         if self.gripper.ndim == 0:

@@ -1,10 +1,10 @@
-"""From a path over voxels to a way that a hand can take: clear of the scene, coming and leaving along its own axis.
+"""Turns a path over voxels into a route of the hand that keeps clear of the scene.
 
-Positions of a planned path come in, with the hand's rotation and grip at each; out come few :class:`Stop` s. The greedy
-planner knows the hand as a point. Here it gets its size: a hand that travels (open, or with a movable thing) leaves its
-place backwards, travels over whatever lies within reach of the path, and comes to its goal along its own axis, from
-above unless it is tilted. A hand that works (closed on nothing, to push; closed on a fixture, to pull) follows the path
-as it is. Only the geometry of surface points decides this.
+Positions of a planned path come in, with the hand's rotation and grip at each; a few :class:`Stop` s go out. The greedy
+planner treats the hand as a point; its size is considered here. A hand that travels (open, or holding a movable object)
+leaves backwards along its axis, passes over everything within reach of the path, and approaches its goal along its own
+axis, from above unless it is tilted. A hand in contact (closed on nothing, to push; closed on a fixture, to pull)
+follows the path unchanged. The decision uses the geometry of surface points only.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ _ASIDE = (0.02, 0.04, 0.06, 0.08, 0.10, 0.12)
 
 @dataclass(frozen=True, kw_only=True)
 class RouteConfig:
-    """How far a hand keeps away. Metres unless noted.
+    """Distances that a hand keeps. Metres unless noted.
 
     Attributes:
         over: vertical room over whatever lies on the way.
         corridor: half width of what counts as on the way.
         approach: the least distance from which a goal is approached along the hand's axis.
-        here: goals nearer than this, horizontally, are gone to straight.
+        here: goals nearer than this, horizontally, are approached straight.
         along: a tilted hand that moves backwards along its axis, by this cosine, needs no detour.
         straight: travelling hands may deviate this much from the planned path, horizontally.
-        bend: working hands may deviate this much from it.
-        level: a closed, empty hand whose goal is less than this share of the way higher or lower, works.
-        work_reach: and is at most this far away.
+        bend: hands in contact may deviate this much from it.
+        level: a closed, empty hand is in contact if its goal is higher or lower by at most this share of the distance
+        work_reach: and at most this far away.
         step: distance of the samples at which obstacles on the way are looked for.
     """
 
@@ -61,7 +61,7 @@ class Stop:
         quat: of the hand, wxyz, [4].
         closed: grip on arrival.
         velocity: share of full speed on the way there.
-        final: the end of a path, which the hand comes to exactly.
+        final: the end of a path, which the hand reaches exactly.
     """
 
     pos: np.ndarray
@@ -74,7 +74,7 @@ class Stop:
 def is_contact_move(
     start: np.ndarray, goal: np.ndarray, *, closed: bool, held: str, attached: str, config: RouteConfig
 ) -> bool:
-    """Whether a motion is meant to touch: the hand is closed on a fixture, or closed, empty, and moves about level."""
+    """Whether a motion is one in contact: closed on a fixture; or closed, empty, and nearly level."""
     if not closed or held:
         return False
     if attached:
@@ -85,7 +85,7 @@ def is_contact_move(
 
 
 def work_route(stops: Sequence[Stop], config: RouteConfig = RouteConfig()) -> list[Stop]:
-    """A path followed as planned, without the stops it can do without."""
+    """A path as planned, without redundant stops."""
     return [stops[i] for i in corners(np.array([stop.pos for stop in stops]), config.bend, _marks(stops))]
 
 
@@ -98,7 +98,7 @@ def travel_route(
         stops: along the path: the first is where the hand is, the last its goal; rotations and grips as wanted there.
         axes: direction of the fingers at the start and at the goal, unit vectors [3].
         world: the scene, the hand at its start.
-        held: the thing in the hand, "" for none.
+        held: the object in the hand, "" for none.
         config: margins.
     """
     aside = _from_under(world, held, stops[0].pos) if held else np.zeros(3)

@@ -1,4 +1,4 @@
-"""Questions to a language model through litellm: retried, counted, and never paid for twice.
+"""Requests to a language model through litellm: retried, counted and cached.
 
 In: chat messages, and which model of which provider (any string litellm knows; ``offline/libero``, the default, is
 ``voxposer.offline`` and needs neither key nor network). Out: the text up to the first stop token, with its tokens and
@@ -35,13 +35,13 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class LlmConfig:
-    """Which model is asked, and how patiently.
+    """Which model is asked, and how often and how long.
 
     Attributes:
         model: litellm's name of it, such as ``gpt-4o`` or ``openai/local``; ``offline/libero`` is rule-based and local.
         timeout_s: seconds for one attempt.
         attempts: how often a question is asked before giving up; the offline writer is asked once.
-        backoff_s: seconds of the first pause; each is twice as long as the one before, up to a second of chance added.
+        backoff_s: seconds of the first pause; each is twice as long as the one before, plus up to a second at random.
         backoff_max_s: seconds of the longest pause, also of one that the server asks for.
         api_base: address of the provider; litellm's own by default.
         api_key: litellm reads the provider's variable (``OPENAI_API_KEY``) by default. Never stored or shown.
@@ -67,7 +67,7 @@ class LlmConfig:
 
 
 class Llm:
-    """A model to ask, with its cache and its bill. Threads may share one."""
+    """A model with its cache and usage counts. Threads may share one."""
 
     def __init__(self, config: LlmConfig | None = None, *, sleep: Callable[[float], None] = time.sleep) -> None:
         """A model as configured, the offline writer by default; nothing is imported or opened before a question.
@@ -84,7 +84,7 @@ class Llm:
 
     @property
     def usage(self) -> Usage:
-        """What has been asked and paid through this object."""
+        """Requests and cost of this object so far."""
         with self._lock:
             return self._usage
 

@@ -15,7 +15,7 @@ Message = Mapping[str, str]
 
 
 class LlmError(ServiceError, HostFault):
-    """A question that the model did not answer.
+    """A request that the model did not answer.
 
     Attributes:
         model: the model asked.
@@ -28,7 +28,7 @@ class LlmError(ServiceError, HostFault):
 
 
 class ReplyError(LlmError):
-    """The model did answer, but with nothing to use: cut off, empty, or that it does not understand."""
+    """The model answered, but with nothing usable: cut off, empty, or not understood."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +38,11 @@ class Reply:
     Attributes:
         text: up to the first stop token, stripped; never empty.
         model: the model as the provider names it.
-        finish_reason: why it ended, the provider's word; ``stop`` as a rule.
+        finish_reason: why it ended, as the provider names it; usually ``stop``.
         prompt_tokens: tokens of the question.
         completion_tokens: tokens of the answer.
         cost_usd: US dollars, None if litellm does not know the model's price.
-        cached: whether it was kept from earlier, and so cost nothing now.
+        cached: whether it came from the cache and cost nothing.
     """
 
     text: str
@@ -56,7 +56,7 @@ class Reply:
 
 @dataclass(frozen=True, kw_only=True)
 class Usage:
-    """What has been asked and paid so far.
+    """Requests and their cost so far.
 
     Attributes:
         calls: answers received from the model, unusable ones included.

@@ -1,4 +1,4 @@
-"""Programs that a language model wrote, run as what they are: hostile until shown otherwise.
+"""Runs programs that a language model wrote, which are not trusted.
 
 In: source text, functions it may call and variables it starts with. Out: the value it returned and its variables, or a
 ``SandboxError`` naming the line and the rule it broke.
