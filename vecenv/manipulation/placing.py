@@ -19,13 +19,13 @@ from vecenv.manipulation.world import Margins, SceneGeometry, around, down_facin
 
 @dataclass(frozen=True)
 class Target:
-    """Where an object's origin may go.
+    """Candidates for an object's origin.
 
     Attributes:
         xy: candidates, world frame, [M, 2].
         cost: what each costs, ascending, [M].
         floor: height that carries it whatever the points say, metres.
-        ignored: things whose points are no obstacle.
+        ignored: objects whose points are no obstacle.
         centre, half: a box to fit in, horizontally, [2] each; None where there is none.
         entry: the way out of a space that is entered from a side, horizontal unit vector [3]; None for one that is
             entered from above.
@@ -70,7 +70,7 @@ def choose_grasp(
     Args:
         world: the scene.
         name: the object.
-        failed: positions of grasps that were tried in vain, relative to the object's origin, world axes.
+        failed: positions of grasps that failed, relative to the object's origin, world axes.
         narrow: the fingers may go in half closed; False where they can only be opened and closed.
     """
     wide = _best_grasp(world, name, failed, world.config.gripper)
@@ -175,13 +175,13 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
 
 
 def put_in(world: SceneGeometry, name: str, target: Target, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Likewise into a space that is entered from a side: the fingers lead, and the thing turns along with the hand.
+    """As :func:`put_down`, into a space that is entered from a side: the fingers lead, and the object turns along.
 
     Args:
         world: the scene.
-        name: the thing held.
+        name: the held object.
         target: a space with a box to fit in.
-        out: the way out of it, horizontal unit vector [3].
+        out: direction out of it, horizontal unit vector [3].
     """
     config = world.config
     obstacles = np.concatenate([world.others(name), world.walls])

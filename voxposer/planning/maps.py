@@ -1,5 +1,5 @@
 # ruff: noqa: F722  (shapes in annotations)
-"""Value maps: points to voxels and back, and the operations on volumes that the planner is made of.
+"""Value maps: points to voxels and back, and the operations on volumes that the planner uses.
 
 In: points in metres (world frame) with the corners of a workspace, or volumes [..., N, N, N]. Out: voxel indices,
 occupancy, distances, blurred and scaled volumes. Everything takes leading batch axes, and volumes may be traced by JAX.

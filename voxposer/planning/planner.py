@@ -112,7 +112,7 @@ def _on_cpu(arrays: tuple[Any, ...]) -> bool:
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# The two ways to the raw path.
+# The two engines of the raw path.
 
 
 def _with_numba(start: Any, target: Any, obstacle: Any, planar: Any, config: PlannerConfig) -> Paths:

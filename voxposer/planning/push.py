@@ -83,9 +83,9 @@ class Push(NamedTuple):
 
     Attributes:
         contact: where the hand touches, [B, 3].
-        direction: unit vector, [B, 3]; zero where the thing is at its target already or has no points.
-        distance: metres along it, [B].
-        cost: predicted distance of the thing's centre from the target, [B]; infinite without points.
+        direction: unit vector, [B, 3]; zero where the object is at its target or has no points.
+        distance: length of the push, metres, [B].
+        cost: predicted distance of the object's centre from the target, [B]; infinite without points.
         predicted: where the model expects the centre, [B, 3].
     """
 
@@ -126,7 +126,7 @@ def best_push(
     """The push that is predicted to bring each thing's centre closest to its target.
 
     Args:
-        points: surface of the thing, [B, M, 3].
+        points: surface of the object, metres, [B, M, 3].
         target: where its centre (the mean of its points) should come to be, [B, 3].
         key: one ``jax.random`` key, or one a slot, [B]: then a slot's push does not depend on the batch it is in.
         config: numbers of the search.
