@@ -20,7 +20,8 @@ import common
 import jax
 import numpy as np
 
-from voxposer.planning.planner import PlannerConfig, optimize_paths
+from voxposer.planning.config import PlannerConfig
+from voxposer.planning.planner import optimize_paths
 from voxposer.planning.push import PushConfig, best_push
 
 from support import voxposer_reference as reference  # isort: skip - common puts the tests on the path

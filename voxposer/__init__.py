@@ -1,1 +1,6 @@
-"""A planner that turns language into value maps and waypoints; not built yet, so there is nothing to import here."""
+"""VoxPoser for batches: language becomes programs, programs become value maps, and maps become waypoints.
+
+``voxposer.agent`` runs the method on any environment of ``vecenv.contract``. ``language`` asks a model for programs and
+``sandbox`` runs them; ``perception`` gives them objects, ``planning`` turns their maps into plans; ``offline`` is a
+rule-based writer of programs that needs no model.
+"""

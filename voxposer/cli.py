@@ -11,7 +11,7 @@ voxposer_app = typer.Typer(help="The VoxPoser planner.", no_args_is_help=True)
 
 @voxposer_app.callback()
 def _group() -> None:
-    """Keeps ``show`` a command of its own name while it is the only one."""
+    """Without a callback, typer would make the only command the group itself."""
 
 
 @voxposer_app.command("show")
@@ -23,18 +23,19 @@ def show_command(
 ) -> None:
     """Plan and follow a task once; write its maps, paths and programs as an HTML page and a PNG."""
     from vecenv.cli import fail
-    from voxposer.show import look_at, parse_task, render_page, save_picture
+    from vecenv.errors import InvalidInput
+    from voxposer.show import parse_task, record_episode, render_page, save_image
 
     try:
         suite, number, episode = parse_task(task)
-    except ValueError as error:
+    except InvalidInput as error:
         fail(str(error))
-    shown = look_at(suite, number, episode, model=model, prompts_dir=prompts_dir)
+    shown = record_episode(suite, number, episode, model=model, prompts_dir=prompts_dir)
     out.mkdir(parents=True, exist_ok=True)
     stem = out / shown.title.replace("/", "_")
     page, picture = stem.with_suffix(".html"), stem.with_suffix(".png")
     page.write_text(render_page(shown), encoding="utf-8")
-    save_picture(shown, picture)
+    save_image(shown, picture)
     typer.echo(f"{'solved' if shown.success else 'not solved'} in {shown.ticks} ticks {shown.cause}".rstrip())
     typer.echo(page)
     typer.echo(picture)

@@ -1,121 +1,54 @@
-"""The functions that language programs call: they look at one frozen snapshot and ask for motions, and move nothing.
+"""The functions that language programs call: they read one frozen snapshot and ask for motions.
 
-A :class:`~voxposer.perception.Perception` comes in with each subtask (:meth:`Interface.begin`). What programs ask for
-is collected as :class:`Request` s, in order; several of one subtask are to be done one after the other. Planning them
-for a whole batch and following the plans is the agent's business (``voxposer.agent``), so nothing that a program does
-can move a robot. Names, arguments and defaults are upstream's (huangwl18/VoxPoser, ``interfaces.py``), a few are
-added.
+A :class:`~voxposer.perception.view.Perception` comes in with each subtask (:meth:`Interface.begin`). The motions that
+programs ask for are collected as :class:`~voxposer.requests.MotionRequest` s, in order; those of one subtask are
+executed one after the other. ``voxposer.agent`` plans and executes them, so no program moves a robot itself. Names,
+arguments and defaults are upstream's (huangwl18/VoxPoser, ``interfaces.py``), with a few additions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vecenv.errors import InvalidInput
 from vecenv.manipulation.world import matrix
-from voxposer.perception import EE_ALIASES, Detected, Perception, quaternion
-
-# A gripper map's rare value takes over the last waypoint from this many voxels away, as upstream's does.
-_GRIP_REACH = 3.0
-
-
-class InterfaceError(InvalidInput):
-    """A program called a function with something that makes no sense; the message says what would."""
-
-
-@dataclass(frozen=True)
-class Request:
-    """One motion that a program asked for, its maps evaluated.
-
-    Attributes:
-        kind: ``"path"`` (plan over maps), ``"stay"`` (no affordance: where the hand is) or ``"home"``.
-        movable: name of what shall move.
-        object_centric: it is a thing, to be pushed, and not the hand.
-        start: voxel from which to plan, [3].
-        targets: bool [N, N, N]; None for ``stay`` and ``home``.
-        avoidance: float32 [N, N, N] in 0..1, None where the program gave none.
-        occupancy: of the thing to be pushed, bool [N, N, N].
-        rotation: wxyz, [4] where it is the same everywhere, else [N, N, N, 4]; likewise the next two.
-        velocity: share of full speed, [] or [N, N, N].
-        gripper: 1 open, 0 closed, [] or [N, N, N].
-    """
-
-    kind: str
-    movable: str
-    object_centric: bool
-    start: np.ndarray
-    targets: np.ndarray | None
-    avoidance: np.ndarray | None
-    occupancy: np.ndarray | None
-    rotation: np.ndarray
-    velocity: np.ndarray
-    gripper: np.ndarray
-
-    def rotation_at(self, voxel: np.ndarray) -> np.ndarray:
-        """Rotation wanted at a voxel, unit quaternion wxyz [4]."""
-        quat = self.rotation if self.rotation.ndim == 1 else self.rotation[tuple(voxel)]
-        length = float(np.linalg.norm(quat))
-        if length < 1e-6:
-            raise InterfaceError("the rotation map holds a quaternion of length zero on the way")
-        return quat / length
-
-    def velocity_at(self, voxel: np.ndarray) -> float:
-        """Share of full speed wanted at a voxel."""
-        return float(self.velocity if self.velocity.ndim == 0 else self.velocity[tuple(voxel)])
-
-    def closed_at(self, voxel: np.ndarray) -> bool:
-        """Whether the grip shall be closed at a voxel."""
-        return float(self.gripper if self.gripper.ndim == 0 else self.gripper[tuple(voxel)]) < 0.5
-
-    def closed_at_end(self, voxel: np.ndarray) -> bool:
-        """Whether it shall be closed at the end of the path.
-
-        Programs mark the few voxels where the grip shall change, and a path may end beside them: the rarer of the two
-        values counts if it is within 3 voxels (upstream's ``_path2traj``).
-        """
-        if self.gripper.ndim == 0:
-            return self.closed_at(voxel)
-        closed = self.gripper < 0.5
-        rare = bool(closed.sum() < closed.size / 2)
-        near = np.argwhere(closed == rare)
-        if len(near) and np.linalg.norm(near - voxel, axis=1).min() <= _GRIP_REACH:
-            return rare
-        return self.closed_at(voxel)
+from voxposer.perception.observation import LazyObservation
+from voxposer.perception.view import HAND_ALIASES, Perception
+from voxposer.quaternions import euler2quat, pointat2quat, qinverse, qmult, quat2euler, quaternion, unit, vector3
+from voxposer.requests import InterfaceError, MotionRequest
 
 
 class Interface:
-    """What the programs of one slot call.
+    """The functions of one slot's programs.
 
     Attributes:
-        requests: what was asked for in this subtask so far.
+        requests: motions that were asked for in this subtask so far.
     """
 
     def __init__(self) -> None:
         self._perception: Perception | None = None
         self._closed = False
-        self.requests: list[Request] = []
+        self.requests: list[MotionRequest] = []
 
     def begin(self, perception: Perception) -> None:
-        """Start a subtask with a fresh snapshot and nothing asked for."""
+        """Start a subtask with a fresh snapshot and no motions."""
         self._perception, self._closed = perception, perception.hand.closed
         self.requests = []
 
-    def taken(self) -> list[Request]:
-        """What was asked for since the last call; its maps are large and no longer kept here."""
+    def taken(self) -> list[MotionRequest]:
+        """The motions asked for since the last call; their maps, which are large, are released here."""
         requests, self.requests = self.requests, []
         return requests
 
     def end(self) -> None:
-        """Let go of snapshot and maps."""
+        """Release the snapshot and the maps."""
         self._perception, self.requests = None, []
 
     @property
     def perception(self) -> Perception:
-        """What is seen now."""
+        """The view of the present snapshot."""
         if self._perception is None:
             raise InterfaceError("no snapshot yet: call begin() first")
         return self._perception
@@ -133,8 +66,8 @@ class Interface:
 
     # -- looking -------------------------------------------------------------------------------------------------------
 
-    def detect(self, name: str) -> Detected:
-        """Observation of a thing, a part, or one of the aliases of hand and table."""
+    def detect(self, name: str) -> LazyObservation:
+        """Observation of an object, a part, or one of the aliases of hand and table."""
         return self.perception.detect(name)
 
     def get_ee_pos(self) -> np.ndarray:
@@ -146,8 +79,8 @@ class Interface:
         size = self.perception.grid.resolution * 100
         if isinstance(direction, str):
             return int(cm / size[_axis(direction)])
-        vector = _vector(direction, "direction")
-        return (cm * _unit(vector) / size).astype(int)
+        vector = vector3(direction, "direction")
+        return (cm * unit(vector) / size).astype(int)
 
     def index2cm(self, index: float, direction: str | None = None) -> float:
         """Voxels as centimetres along an axis, or along the average axis."""
@@ -159,7 +92,7 @@ class Interface:
     def set_voxel_by_radius(self, voxel_map: np.ndarray, voxel_xyz: Any, radius_cm: float = 0, value: Any = 1) -> Any:
         """Set the voxels within a box of half edge ``radius_cm`` around a voxel (upstream's, for a ball)."""
         size = self.perception.grid.size
-        centre = np.clip(np.round(_vector(voxel_xyz, "voxel_xyz")).astype(int), 0, size - 1)
+        centre = np.clip(np.round(vector3(voxel_xyz, "voxel_xyz")).astype(int), 0, size - 1)
         reach = np.array([self.cm2index(max(radius_cm, 0), axis) for axis in "xyz"])
         low, high = np.maximum(centre - reach, 0), np.minimum(centre + reach + 1, size)
         voxel_map[low[0] : high[0], low[1] : high[1], low[2] : high[2]] = value
@@ -215,15 +148,15 @@ class Interface:
         """
         seen = _now(movable)
         name = str(seen["name"])
-        object_centric = name.lower() not in EE_ALIASES
+        object_centric = name.lower() not in HAND_ALIASES
         targets = None if affordance_map is None else self._map(affordance_map, "affordance map") >= 0.999
         if targets is not None and not targets.any():
             raise InterfaceError("the affordance map has no target: no voxel is 1")
         if targets is None and object_centric:
-            raise InterfaceError(f"{name} shall move, but there is no affordance map to say where to")
+            raise InterfaceError(f"{name} is to move, but there is no affordance map with its target")
         if object_centric and name not in self.perception.snapshot.movable:
             raise InterfaceError(f"{name} cannot be pushed: it is fixed")
-        request = Request(
+        request = MotionRequest(
             kind="stay" if targets is None else "path",
             movable=name,
             object_centric=object_centric,
@@ -237,7 +170,7 @@ class Interface:
         )
         self.requests.append(request)
         if not object_centric:
-            self._go_on(request)
+            self._advance_hand(request)
 
     def reset_to_default_pose(self) -> None:
         """Ask for the hand to go where it was when the episode began, the grip as it is."""
@@ -245,12 +178,12 @@ class Interface:
         voxel = self.perception.grid.voxel(home[:3])
         grip = np.asarray(0.0 if self._closed else 1.0)
         self.requests.append(
-            Request("home", "gripper", False, voxel, None, None, None, home[3:].copy(), np.asarray(1.0), grip)
+            MotionRequest("home", "gripper", False, voxel, None, None, None, home[3:].copy(), np.asarray(1.0), grip)
         )
         self.perception.move_hand(home[:3], matrix(home[3:]))
 
-    def _go_on(self, request: Request) -> None:
-        """Let the hand count as being at the end of what was asked for: at the nearest target."""
+    def _advance_hand(self, request: MotionRequest) -> None:
+        """Take the hand to be at the end of a motion, at the nearest target."""
         here = self.perception.grid.voxel(self.perception.ee.pos)
         end, pos = here, self.perception.ee.pos
         if request.targets is not None:
@@ -301,61 +234,3 @@ def _axis(direction: str) -> int:
     if direction not in ("x", "y", "z"):
         raise InterfaceError(f"direction {direction!r}: expected 'x', 'y', 'z' or a vector of 3 numbers")
     return "xyz".index(direction)
-
-
-def _vector(value: Any, what: str) -> np.ndarray:
-    vector = np.asarray(value, float)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise InterfaceError(f"{what}: expected 3 finite numbers, got {value!r}")
-    return vector
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-6 else np.zeros(3)
-
-
-def pointat2quat(vector: Any) -> np.ndarray:
-    """Rotation wxyz [4] of a hand whose fingers point along ``vector`` [3], its x axis as near world x as it can be."""
-    z = _unit(_vector(vector, "vector"))
-    if not z.any():
-        raise InterfaceError("vector: a direction needs a length")
-    aside = np.array([0.0, 1.0, 0.0]) if abs(z[0]) > 0.99 else np.array([1.0, 0.0, 0.0])
-    y = _unit(np.cross(z, aside))
-    return quaternion(np.stack([np.cross(y, z), y, z], axis=1))
-
-
-def qmult(q: Any, r: Any) -> np.ndarray:
-    """Product of quaternions wxyz: first ``r``, then ``q``."""
-    a, b, c, d = np.asarray(q, float)
-    w, x, y, z = np.asarray(r, float)
-    return np.array(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ]
-    )
-
-
-def qinverse(q: Any) -> np.ndarray:
-    """Inverse of a quaternion wxyz."""
-    quat = np.asarray(q, float)
-    return quat * [1, -1, -1, -1] / max(float(quat @ quat), 1e-12)
-
-
-def euler2quat(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Quaternion wxyz of turns about the world's x, then y, then z axis, radians."""
-    turns = [np.array([np.cos(a / 2), 0.0, 0.0, 0.0]) for a in (roll, pitch, yaw)]
-    for i, angle in enumerate((roll, pitch, yaw)):
-        turns[i][1 + i] = np.sin(angle / 2)
-    return qmult(turns[2], qmult(turns[1], turns[0]))
-
-
-def quat2euler(quat: Any) -> np.ndarray:
-    """Roll, pitch, yaw [3] in radians of a quaternion wxyz, the inverse of :func:`euler2quat`."""
-    q = np.asarray(quat, float)
-    m = matrix(q / np.linalg.norm(q))
-    pitch = np.arcsin(np.clip(-m[2, 0], -1.0, 1.0))
-    return np.array([np.arctan2(m[2, 1], m[2, 2]), pitch, np.arctan2(m[1, 0], m[0, 0])])

@@ -1,8 +1,8 @@
-"""Things that shall move themselves: model-predictive pushes along a planned path, one for each look.
+"""Objects that are moved without a grasp: model-predictive pushes along a planned path, one per snapshot.
 
-A :class:`Pushing` (what is pushed, and the way it shall go) and fresh sights of it come in; the stops of one push each
-go out, for all slots that push, in one call of the search. The loop is upstream's (``interfaces.py``, ``execute``): it
-ends when the thing is within a centimetre of the end of its way, and places of the way that lie behind it are left out.
+A :class:`PushTask` (the object and its path) and a fresh view of it come in; the stops of one push each go out, for all
+slots that push, in one call of the search. The loop is upstream's (``interfaces.py``, ``execute``): it ends when the
+object is within a centimetre of the end of its path, and waypoints of the path that lie behind it are skipped.
 """
 
 from __future__ import annotations
@@ -13,37 +13,38 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
+from vecenv.errors import VecenvError
 from vecenv.manipulation.routes import Stop
-from voxposer.perception import Perception
+from voxposer.perception.view import Perception
 from voxposer.planning.push import Push, PushConfig, best_push, push_waypoints
 
 # Pushes searched for at once: one shape, one compilation.
 CHUNK = 8
 
 
-class PushError(RuntimeError):
-    """A thing cannot be pushed where it should go."""
+class PushError(VecenvError, RuntimeError):
+    """An object cannot be pushed where it should go."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PushingConfig:
-    """How things are pushed. Metres unless noted.
+    """How objects are pushed. Metres unless noted.
 
     Attributes:
-        push: of the search, and of the motion where there is ample room.
-        starts: how far before the contact a push may start, and the slant of the fingers, radians, best first. Where
-            what is behind leaves no room, the hand leans over the thing and its fingers reach behind it.
-        near: a thing this close to the end of its way has arrived.
-        most: pushes for one way at most.
+        push: options of the search, and of the motion where there is ample room.
+        starts: distance before the contact at which a push may start, and the slant of the fingers, radians, best
+            first. Where the scene behind leaves no room, the hand leans over the object and reaches behind it.
+        near: an object this close to the end of its path has arrived.
+        most: largest number of pushes for one path.
         over_ground: the grip site stays this far above the table.
-        reach: horizontally from the robot's base, of a hand that points down.
-        slanted_reach: less reach of a hand whose fingers lie level.
-        moved: a thing that moved less than this was pushed in vain.
-        elsewhere: another push touches at least this far from where one was in vain.
-        detour: how far a thing is pushed aside that cannot be pushed along its way.
-        detours: angles between that and the straight way, tried in turn to either side, radians.
-        facing: cosine between a face and the push against it, at least.
-        room: that the hand needs around it where a push starts.
+        reach: horizontal distance from the robot's base that a hand pointing down can reach.
+        slanted_reach: reduction of the reach for a hand whose fingers are level.
+        moved: a push that moved the object less than this has failed.
+        elsewhere: the next push touches at least this far from a failed one.
+        detour: how far an object is pushed aside that cannot be pushed along its path.
+        detours: angles between that and the straight line, tried in turn to either side, radians.
+        facing: smallest cosine between a face and the push against it.
+        room: room that the hand needs around it where a push starts.
         body: the closed hand in its own frame (x, y across the fingers, z out of them), lower and upper corners of the
             fingers, the palm, and the wrist, which reaches to either side.
     """
@@ -78,16 +79,16 @@ class PushingConfig:
 
 
 @dataclass
-class Pushing:
-    """A thing on its way.
+class PushTask:
+    """An object that is pushed along a path.
 
     Attributes:
-        name: of the thing.
-        way: places for its centre, world frame, [P, 3]; the last is where it shall be.
-        cursor: the next of them.
-        pushes: how many there were.
-        begun: where the thing's centre was and where the hand was to touch it in the latest push, [3] each.
-        vain: such touches of pushes that did not move it, relative to its centre, [3] each.
+        name: of the object.
+        way: waypoints of its centre, world frame, metres, [P, 3]; the last is the goal.
+        cursor: index of the next waypoint.
+        pushes: number of pushes so far.
+        begun: the object's centre before the latest push and the contact of that push, [3] each.
+        failed: contacts of pushes that did not move it, relative to its centre, [3] each.
     """
 
     name: str
@@ -95,79 +96,79 @@ class Pushing:
     cursor: int = 0
     pushes: int = 0
     begun: tuple[np.ndarray, np.ndarray] | None = None
-    vain: list[np.ndarray] = field(default_factory=list)
+    failed: list[np.ndarray] = field(default_factory=list)
 
 
-def arrived(pushing: Pushing, perception: Perception, config: PushingConfig = PushingConfig()) -> bool:
-    """Whether the thing is where it shall be, or has been pushed often enough; places behind it are passed over."""
-    centre = perception.snapshot.objects[pushing.name].points.mean(axis=0)
-    _learn(pushing, centre, config)
-    left = (pushing.way[-1] - centre)[:2]
-    if np.linalg.norm(left) <= config.near or pushing.pushes >= config.most:
+def arrived(task: PushTask, perception: Perception, config: PushingConfig = PushingConfig()) -> bool:
+    """Whether the object is at its goal, or was pushed often enough; waypoints that it has passed are skipped."""
+    centre = perception.snapshot.objects[task.name].points.mean(axis=0)
+    _learn(task, centre, config)
+    left = (task.way[-1] - centre)[:2]
+    if np.linalg.norm(left) <= config.near or task.pushes >= config.most:
         return True
-    last = len(pushing.way) - 1
-    while pushing.cursor < last and left @ (pushing.way[pushing.cursor] - centre)[:2] <= config.near**2:
-        pushing.cursor += 1
+    last = len(task.way) - 1
+    while task.cursor < last and left @ (task.way[task.cursor] - centre)[:2] <= config.near**2:
+        task.cursor += 1
     return False
 
 
-def _learn(pushing: Pushing, centre: np.ndarray, config: PushingConfig) -> None:
-    """Remember a push in vain, so that the next one is another: from elsewhere, or as far as to where there is room."""
-    if pushing.begun is None:
+def _learn(task: PushTask, centre: np.ndarray, config: PushingConfig) -> None:
+    """Record a failed push, so that the next one differs: another contact, or an earlier waypoint."""
+    if task.begun is None:
         return
-    before, contact = pushing.begun
-    pushing.begun = None
+    before, contact = task.begun
+    task.begun = None
     if np.linalg.norm((centre - before)[:2]) < config.moved:
-        pushing.vain.append(contact - before)
-        pushing.cursor = max(pushing.cursor - 1, 0)
+        task.failed.append(contact - before)
+        task.cursor = max(task.cursor - 1, 0)
     else:
-        pushing.vain.clear()
+        task.failed.clear()
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What is known before a push is searched for.
+class PushSituation:
+    """The input of the search for a push.
 
     Attributes:
-        pushing: what is pushed where.
+        task: the object and its path.
         perception: the present snapshot.
         lowest: height below which the grip site must not go, metres.
-        free: points that the hand has room to push at, bool [M].
-        goal: where to push the centre now, [3].
+        free: points at which the hand has room to push, bool [M].
+        goal: where to push the centre, [3].
     """
 
-    pushing: Pushing
+    task: PushTask
     perception: Perception
     lowest: float
     free: np.ndarray
     goal: np.ndarray
 
 
-def sight(pushing: Pushing, perception: Perception, config: PushingConfig) -> Sight:
-    """Where a thing can be pushed: to the next place of its way, else to the first later one, else to one side.
+def situation(task: PushTask, perception: Perception, config: PushingConfig) -> PushSituation:
+    """Where an object can be pushed: to its next waypoint, else to the first later one, else to one side.
 
-    The cursor moves along to a place of the way.
+    The cursor of the task moves to the waypoint that is chosen.
 
     Raises:
         PushError: the hand has no room to begin any push.
     """
-    centre = perception.snapshot.objects[pushing.name].points.mean(axis=0)
-    lowest = perception.world.ground(centre[:2]) + config.over_ground
-    for cursor in range(pushing.cursor, len(pushing.way)):
-        free = _touchable(pushing, perception, pushing.way[cursor], lowest, config)
+    centre = perception.snapshot.objects[task.name].points.mean(axis=0)
+    lowest = perception.scene.ground(centre[:2]) + config.over_ground
+    for cursor in range(task.cursor, len(task.way)):
+        free = _touchable(task, perception, task.way[cursor], lowest, config)
         if free.any():
-            pushing.cursor = cursor
-            return Sight(pushing, perception, lowest, free, pushing.way[cursor])
-    for goal in _detours(centre, pushing.way[-1], config):
-        free = _touchable(pushing, perception, goal, lowest, config)
+            task.cursor = cursor
+            return PushSituation(task, perception, lowest, free, task.way[cursor])
+    for goal in _detours(centre, task.way[-1], config):
+        free = _touchable(task, perception, goal, lowest, config)
         if free.any():
-            pushing.cursor = max(pushing.cursor - 1, 0)
-            return Sight(pushing, perception, lowest, free, goal)
-    raise PushError(f"the hand has no room to begin a push of {pushing.name}")
+            task.cursor = max(task.cursor - 1, 0)
+            return PushSituation(task, perception, lowest, free, goal)
+    raise PushError(f"the hand has no room to begin a push of {task.name}")
 
 
 def _detours(centre: np.ndarray, end: np.ndarray, config: PushingConfig) -> list[np.ndarray]:
-    """Places beside the straight way, those that lead away from it least first, [3] each."""
+    """Goals beside the straight line, those that deviate least first, [3] each."""
     ahead = (end - centre) * [1.0, 1.0, 0.0]
     ahead /= max(float(np.linalg.norm(ahead)), 1e-6)
     aside = np.array([-ahead[1], ahead[0], 0.0])
@@ -175,43 +176,43 @@ def _detours(centre: np.ndarray, end: np.ndarray, config: PushingConfig) -> list
     return [centre + config.detour * (np.cos(turn) * ahead + np.sin(turn) * aside) for turn in turns]
 
 
-def next_pushes(sights: Sequence[Sight], config: PushingConfig) -> list[list[Stop]]:
+def next_pushes(situations: Sequence[PushSituation], config: PushingConfig) -> list[list[Stop]]:
     """The stops of the best push for each slot: over the start, start, end, back, up."""
     found: list[list[Stop]] = []
-    for first in range(0, len(sights), CHUNK):
-        found += _searched(sights[first : first + CHUNK], config)
+    for first in range(0, len(situations), CHUNK):
+        found += _searched(situations[first : first + CHUNK], config)
     return found
 
 
-def _searched(sights: Sequence[Sight], config: PushingConfig) -> list[list[Stop]]:
-    clouds = [sight.perception.snapshot.objects[sight.pushing.name] for sight in sights]
+def _searched(situations: Sequence[PushSituation], config: PushingConfig) -> list[list[Stop]]:
+    clouds = [situation.perception.snapshot.objects[situation.task.name] for situation in situations]
     most = max(len(cloud.points) for cloud in clouds)
 
     def stacked(rows: Sequence[np.ndarray]) -> np.ndarray:
         filled = [np.concatenate([row, np.repeat(row[-1:], most - len(row), axis=0)]) for row in rows]
-        return _padded(np.stack(filled), CHUNK - len(sights))
+        return _padded(np.stack(filled), CHUNK - len(situations))
 
     push = best_push(
         stacked([cloud.points for cloud in clouds]),
-        _padded(np.stack([s.goal for s in sights]), CHUNK - len(sights)),
-        jax.vmap(jax.random.key)(_padded(np.array([s.pushing.pushes for s in sights]), CHUNK - len(sights))),
+        _padded(np.stack([s.goal for s in situations]), CHUNK - len(situations)),
+        jax.vmap(jax.random.key)(_padded(np.array([s.task.pushes for s in situations]), CHUNK - len(situations))),
         config.push,
-        valid=_padded(np.stack([np.arange(most) < len(cloud.points) for cloud in clouds]), CHUNK - len(sights)),
+        valid=_padded(np.stack([np.arange(most) < len(cloud.points) for cloud in clouds]), CHUNK - len(situations)),
         normals=stacked([cloud.normals for cloud in clouds]),
-        touchable=stacked([s.free for s in sights]),
-        lowest=_padded(np.array([s.lowest for s in sights]), CHUNK - len(sights)),
+        touchable=stacked([s.free for s in situations]),
+        lowest=_padded(np.array([s.lowest for s in situations]), CHUNK - len(situations)),
     )
-    for i, s in enumerate(sights):
-        s.pushing.begun = clouds[i].points.mean(axis=0), np.asarray(push.contact[i], float)
-        s.pushing.pushes += 1
-        s.pushing.cursor = min(s.pushing.cursor + 1, len(s.pushing.way) - 1)
-    return [_way(i, push, s, config) for i, s in enumerate(sights)]
+    for i, s in enumerate(situations):
+        s.task.begun = clouds[i].points.mean(axis=0), np.asarray(push.contact[i], float)
+        s.task.pushes += 1
+        s.task.cursor = min(s.task.cursor + 1, len(s.task.way) - 1)
+    return [_way(i, push, s, config) for i, s in enumerate(situations)]
 
 
-def _way(slot: int, push: Push, sight: Sight, config: PushingConfig) -> list[Stop]:
+def _way(slot: int, push: Push, situation: PushSituation, config: PushingConfig) -> list[Stop]:
     """The stops of a slot's push, from the first of the starts that has room."""
     contact, ahead = np.asarray(push.contact[slot], float), np.asarray(push.direction[slot], float)
-    perception, name, ground = sight.perception, sight.pushing.name, sight.lowest
+    perception, name, ground = situation.perception, situation.task.name, situation.lowest
     fitting = [s for s in config.starts if _fits(perception, name, contact[None], ahead[None], ground, s, config)[0]]
     distance, slant = (fitting or config.starts)[0]
     chosen = replace(config.push, start_distance=distance, slant=slant)
@@ -221,10 +222,10 @@ def _way(slot: int, push: Push, sight: Sight, config: PushingConfig) -> list[Sto
 
 
 def _touchable(
-    pushing: Pushing, perception: Perception, target: np.ndarray, lowest: float, config: PushingConfig
+    task: PushTask, perception: Perception, target: np.ndarray, lowest: float, config: PushingConfig
 ) -> np.ndarray:
     """Points of a thing whose face looks against a push from there to a target that has room to start, bool [M]."""
-    cloud = perception.snapshot.objects[pushing.name]
+    cloud = perception.snapshot.objects[task.name]
     ahead = (target - cloud.points) * [1.0, 1.0, 0.0]
     ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
     rows = np.flatnonzero((cloud.normals * ahead).sum(axis=1) < -config.facing)
@@ -233,9 +234,9 @@ def _touchable(
         return touchable
     ahead = ahead[rows]
     met = cloud.points[rows] - _reach_back(cloud.points, rows, ahead, lowest, config)[:, None] * ahead
-    name = pushing.name
+    name = task.name
     room = np.any([_fits(perception, name, met, ahead, lowest, start, config) for start in config.starts], axis=0)
-    for place in pushing.vain:
+    for place in task.failed:
         room &= np.linalg.norm((met - cloud.points.mean(axis=0) - place)[:, :2], axis=1) > config.elsewhere
     touchable[rows] = room
     return touchable
@@ -295,7 +296,7 @@ def _obstacles(
     perception: Perception, ignored: tuple[str, ...], contacts: np.ndarray, lowest: float, config: PushingConfig
 ) -> np.ndarray:
     """Surface above the table within reach of a hand at one of the contacts, [N, 3]."""
-    points = np.concatenate([perception.world.others(*ignored), perception.world.walls])
+    points = np.concatenate([perception.scene.others(*ignored), perception.scene.walls])
     points = points[np.linalg.norm((points - contacts.mean(axis=0))[:, :2], axis=1) < 0.4]
     return _thinned(points[points[:, 2] > lowest - config.over_ground + 0.005])
 

@@ -1,4 +1,4 @@
-"""What ``vecenv voxposer show`` writes: what the method makes of a task, as a page to turn around and to read.
+"""Pages and images of ``vecenv voxposer show``: the maps, paths and programs of one task.
 
 A suite, a task and an episode come in; the task is planned and followed once, and an HTML page (plotly, one file, no
 network) and a PNG (matplotlib) go out. Each planned motion has a picture: the scene's surface, targets, what is kept
@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from voxposer.agent import Agent, AgentConfig, Planned
+from vecenv.errors import InvalidInput
+from voxposer.agent import Agent, AgentConfig, PlannedMotion
 from voxposer.language.llm import Llm, LlmConfig
-from voxposer.language.lmp import Call
-from voxposer.steps import obstacle_map
+from voxposer.language.lmp_config import Call
+from voxposer.paths import obstacle_map
 
 # Voxels of an obstacle map above this are drawn, and no more than that many.
 _DRAWN_ABOVE = 0.3
@@ -32,26 +33,26 @@ pre{background:#f5f5f5;padding:.7rem;overflow-x:auto;border-radius:4px}summary{c
 
 
 @dataclass(frozen=True)
-class Shown:
-    """One episode, looked at.
+class EpisodeRecord:
+    """One episode, recorded for display.
 
     Attributes:
         title: suite, task and episode.
-        instruction: what the robot was told.
-        model: what wrote the programs.
-        subtasks: what the planner made of it.
+        instruction: the task in words.
+        model: the model that wrote the programs.
+        subtasks: of the latest pass.
         motions: every motion planned.
         calls: every question to the model.
         success: the task was solved.
         ticks: control ticks it took.
-        cause: why nothing more was tried, "" while something was.
+        cause: why the slot stopped, "" if it did not.
     """
 
     title: str
     instruction: str
     model: str
     subtasks: tuple[str, ...]
-    motions: tuple[Planned, ...]
+    motions: tuple[PlannedMotion, ...]
     calls: tuple[Call, ...]
     success: bool
     ticks: int
@@ -62,30 +63,30 @@ def parse_task(text: str) -> tuple[str, int, int]:
     """Suite, task and episode of ``"libero_goal/0"`` or ``"libero_goal/0/3"``.
 
     Raises:
-        ValueError: it is not that, or there is no such task; the message says what there is.
+        InvalidInput: the text has another form, or there is no such task; the message lists what there is.
     """
     import vecenv
 
     suite, *numbers = text.split("/")
     if not 1 <= len(numbers) <= 2 or not all(number.isdigit() for number in numbers):
-        raise ValueError(f"{text!r}: write SUITE/TASK or SUITE/TASK/EPISODE, such as libero_goal/0")
+        raise InvalidInput(f"{text!r}: write SUITE/TASK or SUITE/TASK/EPISODE, such as libero_goal/0")
     if suite not in vecenv.list_suites():
-        raise ValueError(f"there is no suite {suite!r}; there are {', '.join(vecenv.list_suites())}")
+        raise InvalidInput(f"there is no suite {suite!r}; there are {', '.join(vecenv.list_suites())}")
     task, episode = int(numbers[0]), int(numbers[1]) if len(numbers) == 2 else 0
     count, episodes = len(vecenv.list_tasks(suite)), vecenv.eval_metadata(suite)["episodes_per_task"]
     if task >= count or episode >= episodes:
-        raise ValueError(f"{text!r}: {suite} has tasks 0 to {count - 1} and episodes 0 to {episodes - 1}")
+        raise InvalidInput(f"{text!r}: {suite} has tasks 0 to {count - 1} and episodes 0 to {episodes - 1}")
     return suite, task, episode
 
 
-def look_at(
+def record_episode(
     suite: str, task: int, episode: int = 0, *, model: str = "offline/libero", prompts_dir: Path | None = None
-) -> Shown:
+) -> EpisodeRecord:
     """Plan and follow one episode of a task to its end, and keep what was planned."""
     import vecenv
 
     env = vecenv.make(suite, task=task, episodes=[episode])
-    motions: list[Planned] = []
+    motions: list[PlannedMotion] = []
     try:
         info = env.reset()
         prompts = str(prompts_dir) if prompts_dir else None
@@ -95,11 +96,11 @@ def look_at(
         while not control.done.all() and not agent.slots[0].cause:
             control = agent.step()
         slot = agent.slots[0]
-        return Shown(
+        return EpisodeRecord(
             title=info.episode_id[0],
             instruction=slot.instruction,
             model=model,
-            subtasks=slot.subtasks,
+            subtasks=slot.progress.subtasks,
             motions=tuple(motions),
             calls=tuple(slot.lmps.trace),
             success=bool(control.success[0]),
@@ -113,7 +114,7 @@ def look_at(
 # -- the page ----------------------------------------------------------------------------------------------------------
 
 
-def render_page(shown: Shown) -> str:
+def render_page(shown: EpisodeRecord) -> str:
     """The HTML page, complete in itself."""
     from plotly.offline import get_plotlyjs
 
@@ -156,14 +157,14 @@ def _call_section(call: Call) -> str:
     )
 
 
-def _motion_section(number: int, motion: Planned) -> str:
+def _motion_section(number: int, motion: PlannedMotion) -> str:
     kinds = {"home": "back to where it began", "stay": "where it is", "path": "over maps"}
     words = f"{number}. {motion.text} ({kinds[motion.request.kind]})"
     picture = figure(motion).to_html(full_html=False, include_plotlyjs=False, default_height="520px")
     return f"<h3>{html.escape(words)}</h3>{picture}"
 
 
-def figure(motion: Planned) -> Any:
+def figure(motion: PlannedMotion) -> Any:
     """One motion as a plotly figure."""
     import plotly.graph_objects as go
 
@@ -192,7 +193,7 @@ def _cloud(go: Any, name: str, points: np.ndarray, size: int, colour: str, opaci
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker)
 
 
-def layers(motion: Planned) -> dict[str, np.ndarray]:
+def layers(motion: PlannedMotion) -> dict[str, np.ndarray]:
     """What there is to see of a motion: name -> points [n, 3], metres, world frame; none where there is nothing."""
     perception, request = motion.perception, motion.request
     grid = perception.grid
@@ -210,7 +211,7 @@ def layers(motion: Planned) -> dict[str, np.ndarray]:
     }
 
 
-def _kept_away(motion: Planned) -> np.ndarray:
+def _kept_away(motion: PlannedMotion) -> np.ndarray:
     """Middles of the voxels that the planner kept away from."""
     cost = obstacle_map(motion.perception, motion.request, AgentConfig().route)
     voxels = np.argwhere(cost > _DRAWN_ABOVE)
@@ -220,7 +221,7 @@ def _kept_away(motion: Planned) -> np.ndarray:
 # -- the picture -------------------------------------------------------------------------------------------------------
 
 
-def save_picture(shown: Shown, path: Path) -> None:
+def save_image(shown: EpisodeRecord, path: Path) -> None:
     """All motions side by side as a PNG."""
     from matplotlib.figure import Figure
 
@@ -235,7 +236,7 @@ def save_picture(shown: Shown, path: Path) -> None:
     sheet.savefig(path, dpi=110)
 
 
-def _draw(axes: Any, motion: Planned) -> None:
+def _draw(axes: Any, motion: PlannedMotion) -> None:
     found = layers(motion)
     axes.set_title(motion.text, fontsize=8)
     way = np.concatenate([found["targets"], found["hand's way"]])

@@ -33,8 +33,9 @@ from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.routes import RouteConfig
 from vecenv.manipulation.world import Margins, matrix
 from voxposer.agent import AgentConfig
-from voxposer.perception import PerceptionConfig, quaternion
-from voxposer.planning.plan import Plan, PlanConfig
+from voxposer.perception.config import PerceptionConfig
+from voxposer.planning.plan import PlanConfig, SubtaskPlan
+from voxposer.quaternions import quaternion
 
 SUITE = "simpler/bridge"
 FAMILY = "simpler/"
@@ -159,9 +160,11 @@ class HandView:
         control = self.env.step_ee_pose(poses, hold_steps)
         return replace(control, final_pose=hand_poses(control.final_pose))
 
-    def step_waypoints(self, plan: Plan, max_misses: int | None = None) -> PlanControl:
+    def step_waypoints(self, plan: SubtaskPlan, max_misses: int | None = None) -> PlanControl:
         """Follow a plan of the hand."""
-        control = self.env.step_waypoints(plan._replace(poses=tool_poses(plan.poses)), max_misses=max_misses)
+        control = self.env.step_waypoints(
+            plan._replace(poses=tool_poses(np.asarray(plan.poses))), max_misses=max_misses
+        )
         return replace(control, final_pose=hand_poses(control.final_pose))
 
     def observe_objects(self, points: str = "surface") -> Objects:

@@ -20,7 +20,7 @@ import vecenv
 from vecenv.contract import BatchEnv, Egocentric, Metrics, Objects, ObjectsSnapshot, PointCloud, ResetInfo
 from vecenv.manipulation.grasps import Gripper, clearance, find_grasps
 from vecenv.manipulation.placing import choose_grasp
-from vecenv.manipulation.world import HOME_ROTATION, Margins, World, down_facing, yaw
+from vecenv.manipulation.world import HOME_ROTATION, Margins, SceneGeometry, down_facing, yaw
 
 Cloud = tuple[np.ndarray, np.ndarray]
 
@@ -119,11 +119,11 @@ def test_clearance_is_negative_where_a_finger_would_hit() -> None:
 
 def test_neighbours_turn_the_grasp_where_there_is_a_choice() -> None:
     target = box((0.02, 0.02, 0.03), (0, 0, 0.03))
-    alone = choose_grasp(World(snapshot({"a": target}, ()), Margins()), "a")
+    alone = choose_grasp(SceneGeometry(snapshot({"a": target}, ()), Margins()), "a")
     assert alone is not None
     axis = alone.rotation[:, 1]
     wall = [box((0.01, 0.01, 0.03), tuple(0.06 * sign * axis + [0, 0, 0.03])) for sign in (-1, 1)]
-    between = choose_grasp(World(snapshot({"a": target, "b": wall[0], "c": wall[1]}, ()), Margins()), "a")
+    between = choose_grasp(SceneGeometry(snapshot({"a": target, "b": wall[0], "c": wall[1]}, ()), Margins()), "a")
     assert between is not None
     assert abs(between.rotation[:, 1] @ axis) < 0.1
 

@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 
 from vecenv.contract import ObjectsSnapshot, RegionBox
-from voxposer.language.llm import LlmConfig, Reply, ReplyError
-from voxposer.language.lmp import DynamicObservation, LazyMap, Observation, build_lmps, run_planner
-from voxposer.offline import writer as offline
-from voxposer.offline.words import NotUnderstood
+from voxposer.language.llm import LlmConfig
+from voxposer.language.lmp import build_lmps
+from voxposer.language.observations import DynamicObservation, LazyMap, Observation
+from voxposer.language.replies import Reply, ReplyError
+from voxposer.offline import provider as offline
+from voxposer.offline.names import NotUnderstood
 
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])
 
@@ -204,7 +206,7 @@ class ToyWorld:
         }
 
     def subtasks(self, instruction: str) -> tuple[str, ...]:
-        return run_planner(self.lmps, instruction)
+        return self.lmps.plan(instruction)
 
     def detected(self, phrase: str) -> Observation:
         """The one thing that a phrase means."""

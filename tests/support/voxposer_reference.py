@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.signal import savgol_filter
 
-from voxposer.planning.planner import PlannerConfig
+from voxposer.planning.config import PlannerConfig
 
 
 def normalize(volume: np.ndarray) -> np.ndarray:

@@ -22,7 +22,9 @@ from support.llm_server import HANG, Answer, LlmServer, code, failure, serving
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
 
 from vecenv.util import caching
-from voxposer.language.llm import Llm, LlmConfig, LlmError, ReplyCache, ReplyError, Usage
+from voxposer.language.llm import Llm, LlmConfig
+from voxposer.language.replies import LlmError, ReplyError, Usage
+from voxposer.language.reply_cache import ReplyCache
 
 # Of a library that litellm uses.
 pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
@@ -357,7 +359,8 @@ def test_a_folder_that_cannot_be_made_is_a_warning(server: LlmServer, config: Ll
 WRITER = """
 import sys
 from pathlib import Path
-from voxposer.language.llm import Reply, ReplyCache
+from voxposer.language.replies import Reply
+from voxposer.language.reply_cache import ReplyCache
 
 cache, name = ReplyCache(Path(sys.argv[1])), sys.argv[2]
 print("ready", flush=True)
@@ -418,8 +421,8 @@ from voxposer.language.llm import Llm
 assert "litellm" not in sys.modules
 socket.socket.connect = refuse
 before = dict(os.environ)
-from voxposer import llm
-llm._litellm()
+from voxposer.language import providers
+providers.litellm()
 assert dict(os.environ) == before, set(os.environ) ^ set(before)
 """
 

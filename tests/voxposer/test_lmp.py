@@ -14,23 +14,12 @@ from support.llm_server import Answer, LlmServer, code, failure, serving
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
 
-from voxposer.language.llm import Llm, LlmConfig, LlmError
-from voxposer.language.lmp import (
-    CONFIGS,
-    MAPS,
-    NAMES,
-    Call,
-    DynamicObservation,
-    DynamicObservations,
-    LazyMap,
-    LmpError,
-    Lmps,
-    Observation,
-    build_lmps,
-    code_in,
-    load_prompts,
-    run_planner,
-)
+from voxposer.language.llm import Llm, LlmConfig
+from voxposer.language.lmp import Lmps, build_lmps
+from voxposer.language.lmp_config import CONFIGS, MAPS, NAMES, Call, LmpError
+from voxposer.language.observations import DynamicObservation, DynamicObservations, LazyMap, Observation
+from voxposer.language.prompts import code_in, load_prompts
+from voxposer.language.replies import LlmError
 from voxposer.sandbox.guard import Limits
 
 # Of a library that litellm uses.
@@ -237,7 +226,7 @@ for place in ['left', 'right']:
 
 def test_planning_records_the_subtasks_and_does_nothing(setup: Callable[..., Setup]) -> None:
     robot = setup({("planner", "tidy up"): PLAN})
-    assert run_planner(robot.lmps, "tidy up") == ("grasp the bowl", "move to the left", "move to the right")
+    assert robot.lmps.plan("tidy up") == ("grasp the bowl", "move to the left", "move to the right")
     assert robot.world.done == []
     assert [call.lmp for call in robot.lmps.trace] == ["planner"]
 
@@ -261,7 +250,7 @@ def test_the_planner_itself_does_its_subtasks_in_order(setup: Callable[..., Setu
 def test_a_plan_that_cannot_be_followed_is_an_error(setup: Callable[..., Setup], program: str, told: str) -> None:
     robot = setup({("planner", "tidy up"): program})
     with pytest.raises(LmpError, match=told):
-        run_planner(robot.lmps, "tidy up")
+        robot.lmps.plan("tidy up")
 
 
 # The composer

@@ -13,13 +13,14 @@ import pytest
 from support.offline_world import ToyWorld
 
 from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud
-from voxposer.language.lmp import DynamicObservations, load_prompts
-from voxposer.offline import writer as offline
-from voxposer.offline.composer import write_composer
+from voxposer.language.observations import DynamicObservations
+from voxposer.language.prompts import load_prompts
+from voxposer.offline import provider as offline
+from voxposer.offline.composer_writer import write_composer
 from voxposer.offline.grammar import read_instruction, read_noun
-from voxposer.offline.maps import write_affordance, write_gripper, write_rotation, write_velocity
-from voxposer.offline.planner import write_planner
-from voxposer.offline.words import NotUnderstood, matching, read_names
+from voxposer.offline.map_writer import write_affordance, write_gripper, write_rotation, write_velocity
+from voxposer.offline.names import NotUnderstood, matching, read_names
+from voxposer.offline.planner_writer import write_planner
 
 Middles = dict[str, tuple[float, float, float]]
 
@@ -459,7 +460,7 @@ def test_replies_end_at_stop_tokens_and_at_the_token_limit() -> None:
 def test_the_same_request_gets_the_same_reply_in_every_process() -> None:
     names = ["porcelain_mug_1", "white_yellow_mug_1", "plate_1", "plate_2"]
     call = f"write_planner('put the white mug on the left plate', {names})"
-    code = f"from voxposer.offline.planner import write_planner\nprint({call})"
+    code = f"from voxposer.offline.planner_writer import write_planner\nprint({call})"
     replies = {
         subprocess.run(
             [sys.executable, "-c", code],

@@ -8,7 +8,7 @@ import pytest
 from support.offline_world import ToyWorld
 
 import vecenv
-from voxposer.language.lmp import LmpError
+from voxposer.language.lmp_config import LmpError
 
 LIBERO = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 PRO = tuple(

@@ -15,12 +15,16 @@ from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud, Region
 from vecenv.libero.env import LiberoEnv
 from vecenv.manipulation.grasps import Gripper, room_around
 from vecenv.manipulation.world import matrix
-from voxposer.interface import qmult
-from voxposer.perception import Grid, Hand, Perception, PerceptionError, opening_direction, quaternion
+from voxposer.perception.config import HandState
+from voxposer.perception.grid import VoxelGrid
+from voxposer.perception.observation import PerceptionError
+from voxposer.perception.parts import opening_direction
+from voxposer.perception.view import Perception
+from voxposer.quaternions import qmult, quaternion
 
 
 def see(seen: ObjectsSnapshot, *, closed: bool = False, **options: object) -> Perception:
-    return Perception(seen, Hand(seen.ee_pose, HOME, closed), **options)  # pyright: ignore[reportArgumentType]
+    return Perception(seen, HandState(seen.ee_pose, HOME, closed), **options)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture(scope="module")
@@ -335,7 +339,7 @@ def test_the_hand_that_pushes_a_part_shut_leans_as_far_as_the_robot_leaves_room(
 
 @given(st.tuples(*[st.integers(0, 99)] * 3))
 def test_a_voxels_middle_is_in_it(voxel: tuple[int, int, int]) -> None:
-    grid = Grid(np.array([-0.7, -0.4, 0.81]), np.array([0.3, 0.5, 1.26]))
+    grid = VoxelGrid(np.array([-0.7, -0.4, 0.81]), np.array([0.3, 0.5, 1.26]))
     np.testing.assert_array_equal(grid.voxel(grid.world(np.array(voxel))), voxel)
 
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from voxposer.language.lmp import CONFIGS, load_prompts
-from voxposer.offline import writer as offline
-from voxposer.offline.words import NotUnderstood
+from voxposer.language.lmp_config import CONFIGS
+from voxposer.language.prompts import load_prompts
+from voxposer.offline import provider as offline
+from voxposer.offline.names import NotUnderstood
 from voxposer.sandbox.interpreter import parse
 
 PROMPTS = load_prompts()

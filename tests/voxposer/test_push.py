@@ -16,6 +16,8 @@ from vecenv.util.rotations import quat_to_mat
 from voxposer.planning import push
 from voxposer.planning.push import PushConfig, best_push, push_waypoints
 
+pytestmark = pytest.mark.usefixtures("explicit_ranks")
+
 # Few samples suffice where the best of them is not the question.
 FEW = PushConfig(num_samples=300)
 KEY = jax.random.key(0)

@@ -17,7 +17,8 @@ from support.hostile_programs import HOSTILE
 from support.paths import TESTS
 
 from voxposer.sandbox.guard import Budget, HostFault, Limits, Record
-from voxposer.sandbox.interpreter import RULES, Outcome, SandboxError, parse
+from voxposer.sandbox.interpreter import Outcome, parse
+from voxposer.sandbox.syntax import RULES, SandboxError
 
 LIMITS = Limits(steps=200_000, calls=100)
 
@@ -91,7 +92,7 @@ def test_every_rule_that_a_program_breaks_is_explained() -> None:
 
 IN_LITTLE_ROOM = """
 import resource, sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = [{here!r}, {tests!r}]
 import test_sandbox as tests
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 800 * 2**20,) * 2)
@@ -106,7 +107,7 @@ print("all refused", len(tests.HOSTILE))
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits an address space as Linux does")
 def test_hostile_programs_are_refused_in_little_memory_without_a_file_or_process(tmp_path: Path) -> None:
-    source = IN_LITTLE_ROOM.format(tests=str(TESTS))
+    source = IN_LITTLE_ROOM.format(tests=str(TESTS), here=str(Path(__file__).parent))
     command = [sys.executable, "-B", "-c", source]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.stdout.strip() == f"all refused {len(HOSTILE)}", done.stderr

@@ -17,20 +17,25 @@ from vecenv_eval.policies import extras_of, make_policy
 import vecenv
 from vecenv.contract import ObjectsSnapshot
 from vecenv.manipulation.routes import RouteConfig
-from voxposer.agent import Agent, AgentConfig, along
-from voxposer.interface import Interface, InterfaceError, Request, euler2quat, pointat2quat, qinverse, qmult, quat2euler
-from voxposer.language.llm import Llm, LlmError, Reply
-from voxposer.perception import Hand, Perception
-from voxposer.planning.planner import PlannerConfig
-from voxposer.pushing import PushError, Pushing, PushingConfig, arrived, next_pushes, sight
-from voxposer.steps import obstacle_map, plan_paths
+from voxposer.agent import Agent, AgentConfig
+from voxposer.interface import Interface
+from voxposer.language.llm import Llm
+from voxposer.language.replies import LlmError, Reply
+from voxposer.paths import obstacle_map, plan_paths
+from voxposer.perception.config import HandState
+from voxposer.perception.view import Perception
+from voxposer.planning.config import PlannerConfig
+from voxposer.pushing import PushError, PushingConfig, PushTask, arrived, next_pushes, situation
+from voxposer.quaternions import euler2quat, pointat2quat, qinverse, qmult, quat2euler
+from voxposer.requests import InterfaceError, MotionRequest
+from voxposer.stops import along
 
 CUBE = {"cube_1": box((0.02, 0.02, 0.02), (0.2, 0.1, 0.02))}
 
 
 def begin(seen: ObjectsSnapshot | None = None, *, closed: bool = False) -> Interface:
     interface = Interface()
-    interface.begin(Perception(seen or snapshot(CUBE), Hand(HOME, HOME, closed)))
+    interface.begin(Perception(seen or snapshot(CUBE), HandState(HOME, HOME, closed)))
     return interface
 
 
@@ -106,15 +111,15 @@ def test_maps_that_make_no_sense_are_named(arguments: dict[str, Any], says: str)
 
 def test_a_thing_needs_somewhere_to_go_and_must_not_be_fixed() -> None:
     interface = begin(snapshot({**CUBE, "stove_1": box((0.1, 0.1, 0.02), (-0.2, 0, 0.02))}, fixed=("stove_1",)))
-    with pytest.raises(InterfaceError, match="cube_1 shall move"):
+    with pytest.raises(InterfaceError, match="cube_1 is to move"):
         interface.execute(interface.detect("cube_1"))
     with pytest.raises(InterfaceError, match="stove_1 cannot be pushed"):
         interface.execute(interface.detect("stove_1"), target(interface, 70, 60, 30))
 
 
-def request(gripper: np.ndarray, rotation: np.ndarray = HOME[3:]) -> Request:
+def request(gripper: np.ndarray, rotation: np.ndarray = HOME[3:]) -> MotionRequest:
     one = np.asarray(1.0)
-    return Request("path", "gripper", False, np.zeros(3, int), None, None, None, rotation, one, gripper)
+    return MotionRequest("path", "gripper", False, np.zeros(3, int), None, None, None, rotation, one, gripper)
 
 
 def test_a_path_that_ends_beside_the_marked_voxels_takes_their_grip() -> None:
@@ -191,7 +196,7 @@ def test_the_scene_is_in_the_way_of_a_travelling_hand_and_not_of_a_pulling_one()
         gripper=np.array([0.008, -0.008]),
     )
     free, pulling = begin(), Interface()
-    pulling.begin(Perception(held, Hand(held.ee_pose, HOME, closed=True)))
+    pulling.begin(Perception(held, HandState(held.ee_pose, HOME, closed=True)))
     assert pulling.perception.attached == "cabinet_1"
     for interface in (free, pulling):
         interface.execute(interface.detect("gripper"), target(interface, 70, 78, 50))
@@ -275,8 +280,8 @@ def test_an_instruction_that_was_followed_to_the_end_is_planned_anew_as_often_as
     control = acting.step()
     while not control.done.all():
         control = acting.step()
-    assert acting.slots[0].passes == 2
-    assert acting.slots[0].done_subtasks == 4
+    assert acting.slots[0].progress.passes == 2
+    assert acting.slots[0].progress.begun == 4
     assert acting.slots[0].cause == "followed to the end without success"
 
 
@@ -339,8 +344,8 @@ def plate(x: float = 0.0) -> Perception:
 
 
 def test_a_push_comes_from_behind_and_begins_before_the_thing() -> None:
-    pushing = Pushing("plate_1", np.array([[0.2, 0.0, 0.02]]))
-    (stops,) = next_pushes([sight(pushing, plate(), PushingConfig())], PushingConfig())
+    pushing = PushTask("plate_1", np.array([[0.2, 0.0, 0.02]]))
+    (stops,) = next_pushes([situation(pushing, plate(), PushingConfig())], PushingConfig())
     xs = [stop.pos[0] for stop in stops]
     assert xs[0] == xs[1] < -0.07  # down before it
     assert xs[2] > xs[1] + 0.05  # through the contact
@@ -351,33 +356,33 @@ def test_a_push_comes_from_behind_and_begins_before_the_thing() -> None:
 
 def test_places_that_a_thing_has_passed_are_passed_over() -> None:
     way = np.array([[0.05, 0, 0.02], [0.1, 0, 0.02], [0.3, 0, 0.02]])
-    pushing = Pushing("plate_1", way)
+    pushing = PushTask("plate_1", way)
     assert not arrived(pushing, plate(0.07))
     assert pushing.cursor == 1
-    assert arrived(Pushing("plate_1", way), plate(0.295))
-    assert arrived(Pushing("plate_1", way, pushes=PushingConfig().most), plate())
+    assert arrived(PushTask("plate_1", way), plate(0.295))
+    assert arrived(PushTask("plate_1", way, pushes=PushingConfig().most), plate())
 
 
 def test_a_push_in_vain_is_not_repeated() -> None:
-    pushing = Pushing("plate_1", np.array([[0.2, 0.0, 0.02]]))
-    before = sight(pushing, plate(), PushingConfig())
+    pushing = PushTask("plate_1", np.array([[0.2, 0.0, 0.02]]))
+    before = situation(pushing, plate(), PushingConfig())
     next_pushes([before], PushingConfig())
     assert not arrived(pushing, plate(0.002))  # it hardly moved
-    (vain,) = pushing.vain
-    again = sight(pushing, plate(0.002), PushingConfig())
+    (vain,) = pushing.failed
+    again = situation(pushing, plate(0.002), PushingConfig())
     touched = plate().snapshot.objects["plate_1"].points
     near = np.linalg.norm((touched - vain)[:, :2], axis=1) < 0.02
     assert before.free[near].any()
     assert not again.free[near].any()
     next_pushes([again], PushingConfig())
     assert not arrived(pushing, plate(0.05))
-    assert pushing.vain == []
+    assert pushing.failed == []
 
 
 def test_a_thing_against_a_wall_is_pushed_aside_first() -> None:
     wall = {"wall_1": box((0.005, 0.4, 0.15), (-0.082, 0, 0.15), 8000)}
     seen = begin(snapshot({"plate_1": box((0.07, 0.07, 0.02), (0, 0, 0.02)), **wall}, ("wall_1",))).perception
-    found = sight(Pushing("plate_1", np.array([[0.45, 0.0, 0.02]])), seen, PushingConfig())
+    found = situation(PushTask("plate_1", np.array([[0.45, 0.0, 0.02]])), seen, PushingConfig())
     assert abs(found.goal[1]) > 0.015
     assert found.free.any()
 
@@ -389,7 +394,7 @@ def test_a_thing_with_walls_all_around_cannot_be_pushed() -> None:
     }
     seen = begin(snapshot({"plate_1": box((0.07, 0.07, 0.02), (0, 0, 0.02)), **walls}, tuple(walls))).perception
     with pytest.raises(PushError, match="no room to begin a push of plate_1"):
-        sight(Pushing("plate_1", np.array([[0.2, 0.0, 0.02]])), seen, PushingConfig())
+        situation(PushTask("plate_1", np.array([[0.2, 0.0, 0.02]])), seen, PushingConfig())
 
 
 @pytest.mark.heavy

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from support.voxposer_world import HOME, box, snapshot
 
 from vecenv import actions
-from vecenv.manipulation.routes import RouteConfig, Stop, corners, travel_route, work_route, works
-from vecenv.manipulation.world import Margins, World
-from voxposer.planning.plan import PlanConfig, Row, expand_flips, remaining, slowed, stack
+from vecenv.manipulation.routes import RouteConfig, Stop, corners, is_contact_move, travel_route, work_route
+from vecenv.manipulation.world import Margins, SceneGeometry
+from voxposer.planning.plan import PlanConfig, PlannedWaypoint, expand_flips, remaining, slowed, stack
 
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])
 CONFIG = PlanConfig(settle=2, lengths=4)
@@ -25,8 +25,8 @@ def stop(x: float, z: float = 0.3, *, closed: bool = False, final: bool = False,
     return Stop(np.array([x, 0.0, z]), DOWN, closed, velocity, final)
 
 
-def row(x: float, *, closed: bool = False, hold: int = 0) -> Row:
-    return Row(np.array([x, 0, 0.3, *DOWN]), closed, hold, 0, 1.0)
+def row(x: float, *, closed: bool = False, hold: int = 0) -> PlannedWaypoint:
+    return PlannedWaypoint(np.array([x, 0, 0.3, *DOWN]), closed, hold, 0, 1.0)
 
 
 # -- grip --------------------------------------------------------------------------------------------------------------
@@ -121,15 +121,15 @@ def test_thinning_keeps_the_ends_and_strays_no_further_than_allowed(
         assert (np.linalg.norm(rest - share[:, None] * way, axis=1) <= tolerance + 1e-9).all()
 
 
-def tower_world() -> World:
+def tower_world() -> SceneGeometry:
     """A tower of 25 cm between the hand and a place behind it."""
-    return World(
+    return SceneGeometry(
         snapshot({"tower_1": box((0.03, 0.03, 0.125), (0.2, 0, 0.125))}, ee_pose=HOME * [1, 1, 0.25, 1, 1, 1, 1]),
         Margins(),
     )
 
 
-def travel(stops: list[Stop], world: World, held: str = "") -> list[Stop]:
+def travel(stops: list[Stop], world: SceneGeometry, held: str = "") -> list[Stop]:
     down = np.array([0.0, 0.0, -1.0])
     return travel_route(stops, (down, down), world, held, RouteConfig())
 
@@ -147,7 +147,7 @@ def test_a_travelling_hand_goes_over_what_lies_on_its_way() -> None:
 
 
 def test_what_hangs_from_the_hand_is_carried_over_as_well() -> None:
-    world = World(
+    world = SceneGeometry(
         snapshot(
             {"tower_1": box((0.03, 0.03, 0.125), (0.2, 0, 0.125)), "bottle_1": box((0.02, 0.02, 0.1), (0, 0, 0.1))},
             ee_pose=np.array([0, 0, 0.19, *DOWN]),
@@ -172,7 +172,7 @@ def test_straight_up_is_no_detour() -> None:
 def test_what_something_hangs_over_is_moved_aside_before_it_goes_up() -> None:
     plank = box((0.1, 0.1, 0.01), (0.0, 0.11, 0.15), 2000)
     things = {"plank_1": plank, "cube_1": box((0.02, 0.02, 0.02), (0, 0, 0.03))}
-    world = World(snapshot(things, ee_pose=np.array([0, 0, 0.05, *DOWN])), Margins())
+    world = SceneGeometry(snapshot(things, ee_pose=np.array([0, 0, 0.05, *DOWN])), Margins())
     ups = [stop(0.0, 0.05, closed=True), stop(0.0, 0.1, closed=True), stop(0.0, 0.2, closed=True, final=True)]
     route = travel(ups, world, "cube_1")
     assert route[0].pos[2] == pytest.approx(0.05)
@@ -193,11 +193,11 @@ def test_a_tilted_hand_comes_along_its_own_axis() -> None:
 def test_only_a_closed_hand_without_a_thing_works() -> None:
     start, level, down = np.array([0, 0, 0.2]), np.array([0.15, 0, 0.2]), np.array([0.15, 0, 0.05])
     options = {"held": "", "attached": "", "config": RouteConfig()}
-    assert works(start, level, closed=True, **options)
-    assert not works(start, level, closed=False, **options)
-    assert not works(start, down, closed=True, **options)
-    assert works(start, down, closed=True, **{**options, "attached": "cabinet_1"})
-    assert not works(start, level, closed=True, **{**options, "held": "cube_1"})
+    assert is_contact_move(start, level, closed=True, **options)
+    assert not is_contact_move(start, level, closed=False, **options)
+    assert not is_contact_move(start, down, closed=True, **options)
+    assert is_contact_move(start, down, closed=True, **{**options, "attached": "cabinet_1"})
+    assert not is_contact_move(start, level, closed=True, **{**options, "held": "cube_1"})
 
 
 def test_a_working_hand_follows_its_path() -> None:

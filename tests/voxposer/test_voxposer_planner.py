@@ -16,7 +16,10 @@ from scipy.signal import savgol_filter
 from support import voxposer_reference as reference
 
 from voxposer.planning import planner
-from voxposer.planning.planner import Fault, Paths, PlannerConfig, optimize_paths
+from voxposer.planning.config import Fault, PlannerConfig
+from voxposer.planning.planner import Paths, optimize_paths
+
+pytestmark = pytest.mark.usefixtures("explicit_ranks")
 
 Engine = Literal["jax", "numba"]
 ENGINES: tuple[Engine, ...] = ("jax", "numba")

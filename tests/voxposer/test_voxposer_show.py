@@ -12,20 +12,20 @@ pytest.importorskip("plotly")
 from support.voxposer_world import Obedient, box, snapshot
 from test_voxposer_agent import agent
 
-from voxposer.agent import Planned
-from voxposer.language.lmp import Call
-from voxposer.show import Shown, layers, parse_task, render_page, save_picture
+from voxposer.agent import PlannedMotion
+from voxposer.language.lmp_config import Call
+from voxposer.show import EpisodeRecord, layers, parse_task, render_page, save_image
 
 
-def planned() -> list[Planned]:
-    motions: list[Planned] = []
+def planned() -> list[PlannedMotion]:
+    motions: list[PlannedMotion] = []
     acting, _ = agent(Obedient(snapshot({"cube_1": box((0.02, 0.02, 0.02), (0.2, 0.1, 0.02))})), ("lift",))
     acting._on_planned = motions.append
     acting.step()
     return motions
 
 
-def shown(**changes: object) -> Shown:
+def shown(**changes: object) -> EpisodeRecord:
     values = {
         "title": "libero_goal/0/0",
         "instruction": "lift <it> & hold",
@@ -43,7 +43,7 @@ def shown(**changes: object) -> Shown:
         "cause": "",
         **changes,
     }
-    return Shown(**values)  # pyright: ignore[reportArgumentType]
+    return EpisodeRecord(**values)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_motion_shows_its_targets_path_and_way() -> None:
@@ -71,7 +71,7 @@ def test_the_page_needs_no_network() -> None:
 
 
 def test_the_picture_is_a_png(tmp_path: Path) -> None:
-    save_picture(shown(), tmp_path / "a.png")
+    save_image(shown(), tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 

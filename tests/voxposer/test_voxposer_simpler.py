@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import vecenv
-from vecenv.manipulation.world import HOME_ROTATION, World, matrix
+from vecenv.manipulation.world import HOME_ROTATION, SceneGeometry, matrix
 from voxposer import simpler_scene
 from voxposer.agent import AgentConfig
-from voxposer.offline.planner import write_planner
+from voxposer.offline.planner_writer import write_planner
 from voxposer.simpler_scene import NoHandView, hand_poses, hands, tool_poses
 
 pytest.importorskip("sapien")
@@ -67,7 +67,7 @@ def test_a_scene_without_samples_of_its_table_gets_some(seen: Any, monkeypatch: 
     bare = type(snapshot.scene)(*(np.concatenate([getattr(c, part) for c in clouds]) for part in ("points", "normals")))
     shown = simpler_scene.view(replace(snapshot, scene=bare))
     low = min(cloud.points[:, 2].min() for cloud in clouds)
-    assert World(shown, AgentConfig().perception.margins).ground(np.array([-0.16, 0.0])) == pytest.approx(low)
+    assert SceneGeometry(shown, AgentConfig().perception.margins).ground(np.array([-0.16, 0.0])) == pytest.approx(low)
 
 
 def test_a_hand_moves_to_where_it_is_told(seen: Any) -> None:

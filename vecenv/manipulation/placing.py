@@ -1,8 +1,9 @@
-"""Where a hand with something in it goes to put that down: candidates, what each costs, and the height of rest.
+"""Grasping an object among its neighbours, and putting it down: candidate poses, their cost, and the height of rest.
 
-A :class:`~vecenv.manipulation.world.World` whose hand holds a thing and a :class:`Target` come in; the pose of the hand
-that lets go comes out (:func:`put_down`). Heights come from surface points: of the thing, of what it will rest on, and
-of what the open hand must not touch. :func:`choose_grasp` is the other end of a transfer: how to hold the thing.
+A :class:`~vecenv.manipulation.world.SceneGeometry` whose hand holds an object and a :class:`Target` come in; the pose
+of the hand at the release comes out (:func:`put_down`). Heights come from surface points of the object,
+of what it will rest on, and of what the open hand must not touch. :func:`choose_grasp` gives the grasp at the start of
+a transfer.
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from vecenv.manipulation.grasps import Grasps, Gripper, clearance, find_grasps, room_around
-from vecenv.manipulation.world import Margins, World, around, down_facing, leaning, spun, upright, yaw
+from vecenv.manipulation.world import Margins, SceneGeometry, around, down_facing, leaning, spun, upright, yaw
 
 
 @dataclass(frozen=True)
 class Target:
-    """Where an object's origin may go.
+    """Candidates for an object's origin.
 
     Attributes:
         xy: candidates, world frame, [M, 2].
         cost: what each costs, ascending, [M].
         floor: height that carries it whatever the points say, metres.
-        ignored: things whose points are no obstacle.
+        ignored: objects whose points are no obstacle.
         centre, half: a box to fit in, horizontally, [2] each; None where there is none.
         entry: the way out of a space that is entered from a side, horizontal unit vector [3]; None for one that is
             entered from above.
@@ -58,7 +59,9 @@ class Grasped:
     narrow: bool = False
 
 
-def choose_grasp(world: World, name: str, failed: Sequence[np.ndarray] = (), *, narrow: bool = True) -> Grasped | None:
+def choose_grasp(
+    world: SceneGeometry, name: str, failed: Sequence[np.ndarray] = (), *, narrow: bool = True
+) -> Grasped | None:
     """The best grasp of an object among its neighbours, or None when it offers nothing to hold.
 
     The open hand is tried first, pointing down; where neighbours leave it no room, the hand with half-closed fingers
@@ -67,7 +70,7 @@ def choose_grasp(world: World, name: str, failed: Sequence[np.ndarray] = (), *, 
     Args:
         world: the scene.
         name: the object.
-        failed: positions of grasps that were tried in vain, relative to the object's origin, world axes.
+        failed: positions of grasps that failed, relative to the object's origin, world axes.
         narrow: the fingers may go in half closed; False where they can only be opened and closed.
     """
     wide = _best_grasp(world, name, failed, world.config.gripper)
@@ -83,7 +86,7 @@ def choose_grasp(world: World, name: str, failed: Sequence[np.ndarray] = (), *, 
 
 
 def _best_grasp(
-    world: World, name: str, failed: Sequence[np.ndarray], gripper: Gripper
+    world: SceneGeometry, name: str, failed: Sequence[np.ndarray], gripper: Gripper
 ) -> tuple[Grasped, float] | None:
     """The best grasp of a hand opened so far, and its room."""
     config = world.config
@@ -107,7 +110,7 @@ def _best_grasp(
     return Grasped(grasps.pos[best], rotations[best], float(grasps.width[best]), narrow), float(room[best])
 
 
-def _tilted_grasp(world: World, name: str, failed: Sequence[np.ndarray], tilt: float) -> Grasped | None:
+def _tilted_grasp(world: SceneGeometry, name: str, failed: Sequence[np.ndarray], tilt: float) -> Grasped | None:
     """The best grasp with room of a hand that leans so far to one of eight sides, radians; None if there is none.
 
     In the frame of such a hand it points down, so that everything is as for an upright one.
@@ -135,27 +138,27 @@ def _tilted_grasp(world: World, name: str, failed: Sequence[np.ndarray], tilt: f
     return best
 
 
-def _table_under(world: World, middle: np.ndarray) -> np.ndarray:
+def _table_under(world: SceneGeometry, middle: np.ndarray) -> np.ndarray:
     """Points 1 cm apart on the table around a place, [N, 3]: of the whole scene's samples too few lie there."""
     ticks = np.arange(-0.16, 0.161, 0.01)
     x, y = np.meshgrid(ticks, ticks)
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, world.ground(middle[:2]))], axis=1) + [*middle[:2], 0.0]
 
 
-def _reach_cost(world: World, pos: np.ndarray) -> np.ndarray:
+def _reach_cost(world: SceneGeometry, pos: np.ndarray) -> np.ndarray:
     if world.base is None:
         return np.zeros(len(pos))
     far = np.linalg.norm(pos[:, :2] - world.base, axis=1) - world.config.easy_reach
     return np.maximum(far, 0) / world.config.reach_scale
 
 
-def carry_height(world: World, name: str, hand: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
+def carry_height(world: SceneGeometry, name: str, hand: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
     """Height of the hand at which an object held at ``hand`` passes over everything between two places."""
     hangs = hand[2] - min(world.points(name)[:, 2].min(), hand[2] - world.config.gripper.tip)
     return world.tallest(start, end, name) + hangs + world.config.over_obstacles
 
 
-def put_down(world: World, name: str, target: Target) -> tuple[np.ndarray, np.ndarray]:
+def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarray, np.ndarray]:
     """Position [3] and rotation [3, 3] of the hand when it lets go."""
     if target.entry is not None:
         return put_in(world, name, target, target.entry)
@@ -171,14 +174,14 @@ def put_down(world: World, name: str, target: Target) -> tuple[np.ndarray, np.nd
     return best
 
 
-def put_in(world: World, name: str, target: Target, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Likewise into a space that is entered from a side: the fingers lead, and the thing turns along with the hand.
+def put_in(world: SceneGeometry, name: str, target: Target, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`put_down`, into a space that is entered from a side: the fingers lead, and the object turns along.
 
     Args:
         world: the scene.
-        name: the thing held.
+        name: the held object.
         target: a space with a box to fit in.
-        out: the way out of it, horizontal unit vector [3].
+        out: direction out of it, horizontal unit vector [3].
     """
     config = world.config
     obstacles = np.concatenate([world.others(name), world.walls])
@@ -207,7 +210,7 @@ def _entering(out: np.ndarray, config: Margins) -> list[np.ndarray]:
 
 
 def _put_in_at(
-    world: World, name: str, target: Target, rotation: np.ndarray, obstacles: np.ndarray
+    world: SceneGeometry, name: str, target: Target, rotation: np.ndarray, obstacles: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Position of a hand so turned [3] that lets the thing stand in the middle of a space; what room there is over it.
 
@@ -225,7 +228,7 @@ def _put_in_at(
     return pos + [0.0, 0.0, lift], target.roof - (height + lift + float(high[2]))
 
 
-def _turns(world: World, name: str, target: Target, rotation: np.ndarray) -> list[float]:
+def _turns(world: SceneGeometry, name: str, target: Target, rotation: np.ndarray) -> list[float]:
     """Angles by which the hand may turn what it holds: none, and those that align it with a box it must fit in."""
     if target.half is None:
         return [0.0]
@@ -236,7 +239,9 @@ def _turns(world: World, name: str, target: Target, rotation: np.ndarray) -> lis
     return [0.0, *(float(angle) for angle in aligned if abs(now + angle) < world.config.widest_turn)]
 
 
-def _put_down_at(world: World, name: str, target: Target, xy: np.ndarray, angle: float) -> tuple[np.ndarray, float]:
+def _put_down_at(
+    world: SceneGeometry, name: str, target: Target, xy: np.ndarray, angle: float
+) -> tuple[np.ndarray, float]:
     """Position of the hand [3] that puts the origin over ``xy``, turned by ``angle``; and what that costs."""
     config = world.config
     turn = spun(np.eye(3), angle)

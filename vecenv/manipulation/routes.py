@@ -1,10 +1,10 @@
-"""From a path over voxels to a way that a hand can take: clear of the scene, coming and leaving along its own axis.
+"""Turns a path over voxels into a route of the hand that keeps clear of the scene.
 
-Positions of a planned path come in, with the hand's rotation and grip at each; out come few :class:`Stop` s. The greedy
-planner knows the hand as a point. Here it gets its size: a hand that travels (open, or with a movable thing) leaves its
-place backwards, travels over whatever lies within reach of the path, and comes to its goal along its own axis, from
-above unless it is tilted. A hand that works (closed on nothing, to push; closed on a fixture, to pull) follows the path
-as it is. Only the geometry of surface points decides this.
+Positions of a planned path come in, with the hand's rotation and grip at each; a few :class:`Stop` s go out. The greedy
+planner treats the hand as a point; its size is considered here. A hand that travels (open, or holding a movable object)
+leaves backwards along its axis, passes over everything within reach of the path, and approaches its goal along its own
+axis, from above unless it is tilted. A hand in contact (closed on nothing, to push; closed on a fixture, to pull)
+follows the path unchanged. The decision uses the geometry of surface points only.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vecenv.manipulation.world import World, around
+from vecenv.manipulation.world import SceneGeometry, around
 
 # Hands whose axis has at most this vertical component point down.
 _UPRIGHT = -0.98
@@ -25,18 +25,18 @@ _ASIDE = (0.02, 0.04, 0.06, 0.08, 0.10, 0.12)
 
 @dataclass(frozen=True, kw_only=True)
 class RouteConfig:
-    """How far a hand keeps away. Metres unless noted.
+    """Distances that a hand keeps. Metres unless noted.
 
     Attributes:
         over: vertical room over whatever lies on the way.
         corridor: half width of what counts as on the way.
         approach: the least distance from which a goal is approached along the hand's axis.
-        here: goals nearer than this, horizontally, are gone to straight.
+        here: goals nearer than this, horizontally, are approached straight.
         along: a tilted hand that moves backwards along its axis, by this cosine, needs no detour.
         straight: travelling hands may deviate this much from the planned path, horizontally.
-        bend: working hands may deviate this much from it.
-        level: a closed, empty hand whose goal is less than this share of the way higher or lower, works.
-        work_reach: and is at most this far away.
+        bend: hands in contact may deviate this much from it.
+        level: a closed, empty hand is in contact if its goal is higher or lower by at most this share of the distance
+        work_reach: and at most this far away.
         step: distance of the samples at which obstacles on the way are looked for.
     """
 
@@ -61,7 +61,7 @@ class Stop:
         quat: of the hand, wxyz, [4].
         closed: grip on arrival.
         velocity: share of full speed on the way there.
-        final: the end of a path, which the hand comes to exactly.
+        final: the end of a path, which the hand reaches exactly.
     """
 
     pos: np.ndarray
@@ -71,8 +71,10 @@ class Stop:
     final: bool = False
 
 
-def works(start: np.ndarray, goal: np.ndarray, *, closed: bool, held: str, attached: str, config: RouteConfig) -> bool:
-    """Whether a motion is meant to touch: the hand is closed on a fixture, or closed, empty, and moves about level."""
+def is_contact_move(
+    start: np.ndarray, goal: np.ndarray, *, closed: bool, held: str, attached: str, config: RouteConfig
+) -> bool:
+    """Whether a motion is one in contact: closed on a fixture; or closed, empty, and nearly level."""
     if not closed or held:
         return False
     if attached:
@@ -83,12 +85,12 @@ def works(start: np.ndarray, goal: np.ndarray, *, closed: bool, held: str, attac
 
 
 def work_route(stops: Sequence[Stop], config: RouteConfig = RouteConfig()) -> list[Stop]:
-    """A path followed as planned, without the stops it can do without."""
+    """A path as planned, without redundant stops."""
     return [stops[i] for i in corners(np.array([stop.pos for stop in stops]), config.bend, _marks(stops))]
 
 
 def travel_route(
-    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: World, held: str, config: RouteConfig
+    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: SceneGeometry, held: str, config: RouteConfig
 ) -> list[Stop]:
     """A path raised over the scene.
 
@@ -96,7 +98,7 @@ def travel_route(
         stops: along the path: the first is where the hand is, the last its goal; rotations and grips as wanted there.
         axes: direction of the fingers at the start and at the goal, unit vectors [3].
         world: the scene, the hand at its start.
-        held: the thing in the hand, "" for none.
+        held: the object in the hand, "" for none.
         config: margins.
     """
     aside = _from_under(world, held, stops[0].pos) if held else np.zeros(3)
@@ -110,7 +112,7 @@ def travel_route(
 
 
 def _raised(
-    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: World, held: str, config: RouteConfig
+    stops: Sequence[Stop], axes: tuple[np.ndarray, np.ndarray], world: SceneGeometry, held: str, config: RouteConfig
 ) -> list[Stop]:
     """The way of a hand over which nothing hangs at its start."""
     start, goal = stops[0], stops[-1]
@@ -128,7 +130,7 @@ def _raised(
     return [whole[i] for i in keep]
 
 
-def _from_under(world: World, held: str, hand: np.ndarray) -> np.ndarray:
+def _from_under(world: SceneGeometry, held: str, hand: np.ndarray) -> np.ndarray:
     """The shortest level move [3] after which what is held can go straight up; zero if it can, or if there is none."""
     thing = world.points(held)[::2] - world.hand + hand
     near = np.concatenate([world.others(held), world.walls])
@@ -184,18 +186,18 @@ def _at(pos: np.ndarray, height: float) -> np.ndarray:
     return np.array([pos[0], pos[1], max(height, float(pos[2]))])
 
 
-def _crowded(world: World, hand: np.ndarray, held: str, config: RouteConfig) -> bool:
+def _crowded(world: SceneGeometry, hand: np.ndarray, held: str, config: RouteConfig) -> bool:
     """Whether something is within the hand's reach."""
     return bool((np.linalg.norm(world.others(held) - hand, axis=1) < config.approach).any())
 
 
-def _hangs(world: World, hand: np.ndarray, held: str) -> float:
+def _hangs(world: SceneGeometry, hand: np.ndarray, held: str) -> float:
     """How far the lowest of the hand and what it holds is below the grip site."""
     tip = world.config.gripper.tip
     return max(tip, float(world.hand[2] - world.points(held)[:, 2].min())) if held else tip
 
 
-def _tallest(world: World, path: np.ndarray, held: str, config: RouteConfig) -> float:
+def _tallest(world: SceneGeometry, path: np.ndarray, held: str, config: RouteConfig) -> float:
     """Height of the tallest thing within the corridor around a path, [P, 3]."""
     points = world.others(held)
     highest = -np.inf

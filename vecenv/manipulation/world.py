@@ -1,8 +1,8 @@
-"""One snapshot as planning looks at it: what is where, how high, and which way hands can point.
+"""Geometry of one snapshot for planning: where objects are, how high they are, and rotations of hands.
 
-An :class:`~vecenv.contract.ObjectsSnapshot` comes in; :class:`World` answers what grasping, placing and moving ask of
-it (points of things and of everything else, the ground, the tallest thing on a way). Hands are rotation matrices whose
-third column points out of the palm and whose second is the closing direction.
+An :class:`~vecenv.contract.ObjectsSnapshot` comes in; :class:`SceneGeometry` answers the questions of grasping, placing
+and moving (points of objects and of everything else, the ground, the tallest point along a line). Hands are rotation
+matrices whose third column points out of the palm and whose second is the closing direction.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Margins:
     Attributes:
         gripper: shape of the hand.
         above: the least height over a grasp or a target from which the hand comes straight down.
-        over_obstacles: vertical room over whatever lies on the way.
-        corridor: half width of what counts as on the way.
-        neighbours: points farther than this from a grasp or target are not looked at.
+        over_obstacles: vertical distance kept over obstacles in that corridor.
+        corridor: half width of the corridor around a straight move.
+        neighbours: points farther than this from a grasp or target are ignored.
         narrow: half opening of a half-closed hand.
         narrow_ticks: ticks of closing that take an open hand there.
         least_room: least room for the hand between neighbours, where there is a choice.
@@ -40,8 +40,8 @@ class Margins:
         retry_radius: a grasp this close to one that failed is taken last.
         touchdown: gap left under an object when it is released.
         support_radius: points this close horizontally rest on one another.
-        high_cost: coming to rest higher than the target's floor, on something else, costs this much a metre.
-        drop_cost: letting go above the place of rest, for want of room for the hand, costs this much a metre.
+        high_cost: cost per metre of coming to rest higher than the target's floor, on something else.
+        drop_cost: cost per metre of releasing above the height of rest because the hand has no room.
         widest_turn: hands turn no further than this from home, radians.
         overhang_scale: sticking out this much of a box to fit in costs one point.
         grasp_tilts: of a hand from the vertical, tried where no upright one has room to grasp, radians.
@@ -77,16 +77,16 @@ class Margins:
     retreat: float = 0.08
 
 
-class World:
-    """One snapshot, as planning looks at it.
+class SceneGeometry:
+    """The geometry of one snapshot.
 
     Args:
         snapshot: ground truth of one slot.
         config: margins.
-        base: where the robot stands, [2], None where reach does not matter.
+        base: position of the robot's base, [2], None to ignore reach.
 
     Attributes:
-        walls: points on drawers, handles, doors and knobs, of which a whole fixture's samples have too few.
+        walls: extra points on drawers, handles, doors and knobs, which are sampled too sparsely.
     """
 
     def __init__(self, snapshot: ObjectsSnapshot, config: Margins, base: np.ndarray | None = None) -> None:
@@ -102,7 +102,7 @@ class World:
         self.hand_rotation = matrix(snapshot.ee_pose[3:])
 
     def points(self, name: str) -> np.ndarray:
-        """Surface points of one thing, [N, 3]."""
+        """Surface points of one object, metres, [N, 3]."""
         return self.snapshot.objects[name].points
 
     def others(self, *names: str) -> np.ndarray:
@@ -111,13 +111,13 @@ class World:
         return np.concatenate([*clouds, self.scenery])
 
     def ground(self, xy: np.ndarray) -> float:
-        """Height of the table or floor around a place."""
+        """Height of the table or floor around a position [2], metres."""
         up = self._scenery_up
         near = up[np.linalg.norm(up[:, :2] - xy, axis=1) < 0.2]
         return float(near[:, 2].max()) if len(near) else float(self.scenery[:, 2].min())
 
     def tallest(self, start: np.ndarray, end: np.ndarray, *ignored: str) -> float:
-        """Height of the tallest thing on the straight way between two places."""
+        """Height of the highest point in the corridor between two positions, metres."""
         points = self.others(*ignored)
         way = end[:2] - start[:2]
         share = np.clip((points[:, :2] - start[:2]) @ way / max(float(way @ way), 1e-9), 0, 1)

@@ -22,260 +22,26 @@ closed: programs are checked and bounded, a query is one line, and each LMP gets
 from __future__ import annotations
 
 import contextlib
-import copy
 import functools
-import re
-import textwrap
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
-from voxposer.language.llm import Llm, LlmError, Message, Reply, ReplyError
+from voxposer.language.llm import Llm
+from voxposer.language.lmp_config import ACTIONS, CONFIGS, MAPS, RESTRICTED, Call, LmpConfig, LmpError
+from voxposer.language.observations import DynamicObservation, DynamicObservations, LazyMap, Observation
+from voxposer.language.prompts import chat_messages, code_in, lines, load_prompts, query_line
+from voxposer.language.replies import LlmError, Message, Reply, ReplyError
 from voxposer.sandbox import interpreter as sandbox
-from voxposer.sandbox.guard import Budget, HostFault, Limits, Opaque, Record, RecordList
-from voxposer.sandbox.interpreter import Program, SandboxError
-
-MAPS = ("get_affordance_map", "get_avoidance_map", "get_rotation_map", "get_velocity_map", "get_gripper_map")
-NAMES = ("planner", "composer", "parse_query_obj", *MAPS)
+from voxposer.sandbox.guard import Budget, HostFault, Limits, RecordList
+from voxposer.sandbox.interpreter import Program
+from voxposer.sandbox.syntax import SandboxError
 
 # Subtasks of one instruction, and characters of one query.
 _SUBTASKS, _QUERY_CHARS = 100, 1000
-
-_SYSTEM = "You program a robot arm that works at a table. You write short, careful Python and answer with code only."
-_TASK = """Queries are for `{name}`. Each is answered by a short program in the manner of these examples:
-
-```
-{prompt}
-```
-
-Answer every query I send next with the program for it, and nothing else: no imports, no prose (comments are welcome), \
-and not the query again. Use what the examples use, in the same way. Coordinates: x runs from back to front, y from \
-left to right, z from bottom to top."""
-_READY = "Understood. Send me a query and I answer with its program."
-
-
-class LmpError(HostFault):
-    """A language program that could not be run, or not on.
-
-    Attributes:
-        lmp: which one.
-        query: what it was asked.
-        rule: the rule of the sandbox that was broken; ``reply`` if the model gave no program, ``query`` for a query
-            that cannot be asked, ``result`` for a value of the wrong kind.
-        reason: what happened.
-        line: line of the program, None if there is none.
-    """
-
-    def __init__(self, lmp: str, query: str, rule: str, reason: str, line: int | None = None) -> None:
-        where = "" if line is None else f"line {line}: "
-        super().__init__(f"{lmp}({query!r}): {where}{reason} [rule: {rule}]")
-        self.lmp, self.query, self.rule, self.reason, self.line = lmp, query, rule, reason, line
-
-
-# What programs hold
-
-
-class Observation(Record, Mapping[str, Any]):
-    """What is known of a thing at one moment: fields such as ``position``, ``aabb`` and ``normal``.
-
-    Reading a field gives a copy of an array, list or dictionary. Fields whose names start with an underscore are for
-    the host alone. Observations are compared by identity.
-    """
-
-    def __init__(self, fields: Mapping[str, Any]) -> None:
-        self._fields = dict(fields)
-
-    def fields(self) -> Collection[str]:
-        """The names that programs may read."""
-        return [name for name in self._fields if not name.startswith("_")]
-
-    def __getitem__(self, name: str, /) -> Any:
-        value = self._fields[name]
-        return copy.deepcopy(value) if isinstance(value, (np.ndarray, list, dict)) else value
-
-    def __getattr__(self, name: str) -> Any:
-        fields = self.__dict__.get("_fields", {})
-        if name not in fields:
-            raise AttributeError(f"the observation has no {name!r}; it has {', '.join(sorted(fields))}")
-        return self[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._fields)
-
-    def __len__(self) -> int:
-        return len(self._fields)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
-    def __hash__(self) -> int:
-        return id(self)
-
-    def __str__(self) -> str:
-        return str(self._fields.get("name", "observation"))
-
-
-class DynamicObservation(Record):
-    """A thing as it is whenever it is looked at: each read runs the program that finds it again."""
-
-    def __init__(self, now: Callable[[], Observation]) -> None:
-        self._now = now
-
-    def __call__(self) -> Observation:
-        """The thing as it is now."""
-        return self._now()
-
-    def fields(self) -> Collection[str]:
-        """The names that programs may read."""
-        return self._now().fields()
-
-    def __getitem__(self, name: str, /) -> Any:
-        return self._now()[name]
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return getattr(self._now(), name)
-
-    def __str__(self) -> str:
-        return str(self._now())
-
-
-class DynamicObservations(RecordList):
-    """Several things as they are whenever they are looked at."""
-
-    def __init__(self, now: Callable[[], Sequence[Observation]]) -> None:
-        self._now = now
-
-    def __call__(self) -> list[Observation]:
-        """The things as they are now."""
-        return list(self._now())
-
-    def __len__(self) -> int:
-        return len(self._now())
-
-    def __iter__(self) -> Iterator[DynamicObservation]:
-        return (self[place] for place in range(len(self)))
-
-    @overload
-    def __getitem__(self, index: int) -> DynamicObservation: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[DynamicObservation]: ...
-    def __getitem__(self, index: int | slice) -> DynamicObservation | list[DynamicObservation]:
-        if isinstance(index, slice):
-            return [self[place] for place in range(*index.indices(len(self)))]
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"{index} is not among {len(self)} observations")
-        return DynamicObservation(lambda: self._now()[index])
-
-
-class LazyMap(Opaque):
-    """A map of the voxel grid, still a program: calling it runs the program on what is there now.
-
-    Attributes:
-        lmp: which LMP wrote it.
-        query: what it was asked.
-    """
-
-    def __init__(self, lmp: str, query: str, now: Callable[[], np.ndarray]) -> None:
-        self.lmp, self.query, self._now = lmp, query, now
-
-    def __call__(self) -> np.ndarray:
-        """The map, float64: ``[N, N, N]``, or ``[N, N, N, 4]`` (quaternions wxyz) for rotations.
-
-        Raises:
-            LmpError: the program breaks a rule, or made something else.
-        """
-        return self._now()
-
-
-# What an LMP is
-
-
-@dataclass(frozen=True, kw_only=True)
-class LmpConfig:
-    """One language program; upstream's keys.
-
-    Attributes:
-        name: the function programs call it by.
-        stop: tokens its answer ends at.
-        max_tokens: length of its answer at most.
-        temperature: of the model.
-        query_prefix: put before a query.
-        query_suffix: put after it.
-        maintain_session: whether earlier queries and answers are shown again, and their variables kept.
-        include_context: whether the model sees, and the program has, the list ``objects``.
-        has_return: whether the program returns a value.
-        return_val_name: the variable that is returned.
-    """
-
-    name: str
-    stop: tuple[str, ...] = ("# Query: ", "objects =")
-    max_tokens: int = 512
-    temperature: float = 0.0
-    query_prefix: str = "# Query: "
-    query_suffix: str = "."
-    maintain_session: bool = False
-    include_context: bool = False
-    has_return: bool = True
-    return_val_name: str = "ret_val"
-
-
-CONFIGS: Mapping[str, LmpConfig] = MappingProxyType(
-    {
-        "planner": LmpConfig(name="planner", stop=("# Query: ", "objects = "), include_context=True, has_return=False),
-        "composer": LmpConfig(name="composer", has_return=False),
-        "parse_query_obj": LmpConfig(name="parse_query_obj", include_context=True),
-        **{name: LmpConfig(name=name) for name in MAPS},
-    }
-)
-
-# Functions that act, and the only LMPs whose programs may call them: maps and references are evaluated whenever
-# someone looks, so nothing may happen when they are.
-_ACTIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "planner": ("composer",),
-        "composer": ("execute", "reset_to_default_pose", "parse_query_obj", *MAPS),
-        "parse_query_obj": (),
-        **dict.fromkeys(MAPS, ("parse_query_obj",)),
-    }
-)
-_RESTRICTED = frozenset(name for names in _ACTIONS.values() for name in names)
-
-
-@dataclass(kw_only=True)
-class Call:
-    """One question to the model, for people to read.
-
-    Attributes:
-        lmp: which language program.
-        query: what it was asked.
-        context: the context line, empty without.
-        model: the model asked.
-        code: its answer without fences; empty if there was none.
-        cached: whether the answer was kept from earlier.
-        prompt_tokens: tokens of the question, as counted when it was asked.
-        completion_tokens: tokens of the answer, likewise.
-        cost_usd: its price, None if unknown.
-        error: what went wrong with the answer or its program, None if nothing did.
-    """
-
-    lmp: str
-    query: str
-    context: str
-    model: str
-    code: str = ""
-    cached: bool = False
-    prompt_tokens: int = 0
-    completion_tokens: int = 0
-    cost_usd: float | None = None
-    error: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -483,15 +249,10 @@ class Lmps:
             raise
 
     def _messages(self, config: LmpConfig, call: Call) -> list[Message]:
-        """The request: examples first, then the query with its context."""
+        """The request: examples and earlier exchanges first, then the query with its context."""
         session = self._sessions.get(config.name, "")
         prompt = self._prompt(config) + (f"\n\n{session}" if session else "")
-        return [
-            {"role": "system", "content": _SYSTEM},
-            {"role": "user", "content": _TASK.format(name=config.name, prompt=prompt)},
-            {"role": "assistant", "content": _READY},
-            {"role": "user", "content": _lines(call.context, _query_line(config, call.query))},
-        ]
+        return chat_messages(config, prompt, call.context, call.query)
 
     def _prompt(self, config: LmpConfig) -> str:
         """The examples, with upstream's placeholder for the line that imports the functions."""
@@ -527,7 +288,7 @@ class Lmps:
 
     def _allowed(self, name: str, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
         """The functions that an LMP's programs may call."""
-        return {key: value for key, value in functions.items() if key not in _RESTRICTED or key in _ACTIONS[name]}
+        return {key: value for key, value in functions.items() if key not in RESTRICTED or key in ACTIONS[name]}
 
     @contextlib.contextmanager
     def _running(self, written: _Written) -> Iterator[Budget]:
@@ -565,8 +326,8 @@ class Lmps:
 
     def _remember(self, written: _Written, variables: Mapping[str, Any]) -> None:
         config = written.config
-        said = _lines(written.call.context, _query_line(config, written.query), written.call.code)
-        self._sessions[config.name] = _lines(self._sessions.get(config.name, ""), said)
+        said = lines(written.call.context, query_line(config, written.query), written.call.code)
+        self._sessions[config.name] = lines(self._sessions.get(config.name, ""), said)
         self._session_variables[config.name] = dict(variables)
 
 
@@ -593,53 +354,10 @@ def build_lmps(
     return Lmps(functions, llm, load_prompts(prompts_dir), limits=limits, configs=configs)
 
 
-def load_prompts(prompts_dir: str | Path | None = None) -> dict[str, str]:
-    """The examples of each LMP, from the package or a folder.
-
-    Raises:
-        FileNotFoundError: a prompt is missing.
-    """
-    where = resources.files("voxposer") / "prompts" if prompts_dir is None else Path(prompts_dir)
-    return {name: _prompt_file(where, name).read_text(encoding="utf-8").strip() for name in NAMES}
-
-
-def _prompt_file(where: Traversable, name: str) -> Traversable:
-    files = [where / f"{name}.txt", where / f"{name}_prompt.txt"]
-    found = next((file for file in files if file.is_file()), None)
-    if found is None:
-        raise FileNotFoundError(f"no prompt for {name}: neither {name}.txt nor {name}_prompt.txt is in {where}")
-    return found
-
-
-def run_planner(lmps: Lmps, instruction: str) -> tuple[str, ...]:
-    """The subtasks that the planner splits an instruction into, in order; nothing is done.
-
-    Raises:
-        LmpError: the planner's program cannot be run.
-        LlmError: the model does not answer.
-    """
-    return lmps.plan(instruction)
-
-
-def code_in(text: str) -> str:
-    """The code in a model's answer: what stands in fences, if there are any, without common indentation."""
-    fenced = re.findall(r"^[ \t]*```[^\n]*\n(.*?)(?:^[ \t]*```|\Z)", text, re.DOTALL | re.MULTILINE)
-    code = "\n".join(block.strip("\n") for block in fenced) if fenced else text.replace("```", "")
-    return textwrap.dedent(code.replace("\r\n", "\n").expandtabs(4).strip("\n")).rstrip()
-
-
 @functools.lru_cache(maxsize=4096)
 def _parse(code: str, limits: Limits) -> Program:
     """A program; batches of episodes are answered with the same few over and over."""
     return sandbox.parse(code, limits=limits)
-
-
-def _query_line(config: LmpConfig, query: str) -> str:
-    return f"{config.query_prefix}{query}{config.query_suffix}"
-
-
-def _lines(*parts: str) -> str:
-    return "\n".join(part for part in parts if part)
 
 
 def _recorder(subtasks: list[str]) -> Callable[[Any], None]:

@@ -1,1 +1,1 @@
-"""A rule-based writer of programs: no network, no model."""
+"""A rule-based provider of programs for litellm: needs no network and no model."""

@@ -1,8 +1,8 @@
 """Grammar of the offline writer: from an instruction to actions on noun phrases.
 
-In comes English as LIBERO, LIBERO-PRO and SIMPLER write it ("take the black bowl from the top drawer and put it on the
-plate"); out come :class:`Action` s in order, with pronouns resolved and things left unsaid filled in. No entity names
-and no positions are known here: a :class:`Noun` holds words and how the thing stands to others.
+English as in LIBERO and SIMPLER ("take the black bowl from the top drawer and put it on the plate") comes in;
+:class:`Action` s go out in order, with pronouns resolved and implicit objects filled in. No entity names and no
+positions are known here: a :class:`Noun` holds words and relations to other objects.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from voxposer.offline.words import COLOURS, SIDES, NotUnderstood, singular
+from voxposer.offline.names import COLOURS, SIDES, NotUnderstood, singular
 
 
 @dataclass(frozen=True, kw_only=True)
 class Relation:
-    """How a thing stands to others.
+    """Relation of an object to others.
 
     Attributes:
         kind: on, in, top_of, under, near, between, from, outside, center, or left_of, right_of, front_of, back_of.
-        refs: what it stands to; two for between.
-        negated: it does not.
+        refs: the other objects; two for between.
+        negated: whether the relation must not hold.
     """
 
     kind: str
@@ -35,8 +35,8 @@ class Noun:
 
     Attributes:
         words: content words, singular, the noun itself last; what it is a part of comes first.
-        side: which of several alike things: left, right, front, back, middle, top or bottom.
-        relation: how it stands to other things.
+        side: which of several equal objects: left, right, front, back, middle, top or bottom.
+        relation: to other objects.
         plural: it was said in the plural, or with "both" or "all".
         indefinite: it was said with "a" or "any": one is as good as another.
     """
@@ -49,7 +49,7 @@ class Noun:
 
     @property
     def is_pronoun(self) -> bool:
-        """Whether it only points back."""
+        """Whether it refers to an object named before."""
         return self.words in {("it",), ("them",), ("one",)}
 
     def __str__(self) -> str:

@@ -1,7 +1,7 @@
-"""Sentences and variables: what the offline writer's composer and map writers share.
+"""Tables of rules, and the variables of generated programs: shared by the composer and map writers.
 
-A writer is a table of rules, sentence pattern and function; :func:`choose` runs the function of the first pattern that
-matches a whole query. Things are spoken of in phrases that parse_query_obj understands; :func:`get` writes that call.
+A writer is a table of sentence patterns and functions; :func:`choose` runs the function of the first pattern that
+matches a whole query. Objects are named by phrases that parse_query_obj understands; :func:`get` writes that call.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import keyword
 import re
 from collections.abc import Callable, Sequence
 
-from voxposer.offline.words import NotUnderstood, name_words
+from voxposer.offline.names import NotUnderstood, name_words
 
 Groups = dict[str, str]
 Writer = Callable[[Groups], list[str]]
@@ -39,7 +39,7 @@ def choose(rules: Rules, query: str, lmp: str) -> str:
     """The program of the first rule that matches the whole query.
 
     Raises:
-        NotUnderstood: none does; the message names the LMP and quotes the query.
+        NotUnderstood: no rule matches; the message names the LMP and quotes the query.
     """
     text = " ".join(query.strip().rstrip(".").split())
     for pattern, writer in rules:
@@ -50,7 +50,7 @@ def choose(rules: Rules, query: str, lmp: str) -> str:
 
 
 def variable(phrase: str) -> str:
-    """A variable for a thing: its noun, "the black bowl next to the plate" -> ``bowl``."""
+    """A variable for an object: its noun, "the black bowl next to the plate" -> ``bowl``."""
     words = name_words(re.sub(r"[^\w\s]", " ", _QUALIFIED.split(phrase)[0])) or ("thing",)
     return (
         words[-1] if words[-1].isidentifier() and not keyword.iskeyword(words[-1]) and words[-1] not in _TAKEN else "it"
@@ -58,5 +58,5 @@ def variable(phrase: str) -> str:
 
 
 def get(phrase: str, name: str = "") -> str:
-    """The line that looks a thing up."""
+    """The line that looks an object up."""
     return f"{name or variable(phrase)} = parse_query_obj({phrase!r})"

@@ -1,4 +1,5 @@
-"""Value maps: points to voxels and back, and the operations on volumes that the planner is made of.
+# ruff: noqa: F722  (shapes in annotations)
+"""Value maps: points to voxels and back, and the operations on volumes that the planner uses.
 
 In: points in metres (world frame) with the corners of a workspace, or volumes [..., N, N, N]. Out: voxel indices,
 occupancy, distances, blurred and scaled volumes. Everything takes leading batch axes, and volumes may be traced by JAX.
@@ -17,6 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Num, Shaped
+
+AnyArray = Array | np.ndarray
 
 # Loop bodies repeated so often per pass over memory; measured on a CPU, where more costs compile time and cache misses.
 _TAPS_AT_ONCE = 20
@@ -26,7 +30,12 @@ _CLEAR_OF_TARGET = 0.15
 _CLEAR_OF_START = 0.1
 
 
-def to_voxel(points: Any, lower: Any, upper: Any, size: int = 100) -> Any:
+def to_voxel(
+    points: Num[AnyArray, "*batch 3"],
+    lower: Num[AnyArray, "*#batch 3"],
+    upper: Num[AnyArray, "*#batch 3"],
+    size: int = 100,
+) -> Any:
     """Indices of the voxels that points lie in.
 
     The corners of the workspace are the *centres* of the first and last voxels, and points outside go to the nearest
@@ -47,19 +56,32 @@ def to_voxel(points: Any, lower: Any, upper: Any, size: int = 100) -> Any:
     xp = _namespace(points)
     points, lower, upper = (xp.asarray(x, dtype="float32") for x in (points, lower, upper))
     _require_bounds(points, lower, upper)
+    lower, upper = _of_rank(points.ndim, lower, upper)
     fraction = (xp.clip(points, lower, upper) - lower) / (upper - lower)
     return xp.round(fraction * (size - 1)).astype("int32")
 
 
-def to_world(voxels: Any, lower: Any, upper: Any, size: int = 100) -> Any:
+def to_world(
+    voxels: Num[AnyArray, "*batch 3"],
+    lower: Num[AnyArray, "*#batch 3"],
+    upper: Num[AnyArray, "*#batch 3"],
+    size: int = 100,
+) -> Any:
     """Centres of voxels in the world frame, float32 [..., 3] metres; ``voxels`` [..., 3] may lie between centres."""
     xp = _namespace(voxels)
     voxels, lower, upper = (xp.asarray(x, dtype="float32") for x in (voxels, lower, upper))
+    lower, upper = _of_rank(voxels.ndim, lower, upper)
     return voxels / (size - 1) * (upper - lower) + lower
 
 
 @partial(jax.jit, static_argnames="size")
-def voxelize(points: Any, lower: Any, upper: Any, size: int = 100, valid: Any = None) -> jax.Array:
+def voxelize(
+    points: Num[AnyArray, "*batch M 3"],
+    lower: Num[AnyArray, "*#batch 3"],
+    upper: Num[AnyArray, "*#batch 3"],
+    size: int = 100,
+    valid: Bool[AnyArray, "*#batch M"] | None = None,
+) -> Bool[Array, "*batch N N N"]:
     """Which voxels hold a point.
 
     Args:
@@ -75,7 +97,7 @@ def voxelize(points: Any, lower: Any, upper: Any, size: int = 100, valid: Any = 
     points = jnp.asarray(points)
     lower, upper = (jnp.broadcast_to(jnp.asarray(x), (*points.shape[:-2], 3))[..., None, :] for x in (lower, upper))
     usable = jnp.isfinite(points).all(-1)
-    usable = usable if valid is None else usable & valid
+    usable = usable if valid is None else usable & jnp.broadcast_to(valid, usable.shape)
     x, y, z = jnp.moveaxis(to_voxel(jnp.where(usable[..., None], points, lower), lower, upper, size), -1, 0)
     flat = jnp.where(usable, (x * size + y) * size + z, size**3).reshape(-1, points.shape[-2])
     slots = jnp.arange(len(flat))[:, None]
@@ -83,7 +105,7 @@ def voxelize(points: Any, lower: Any, upper: Any, size: int = 100, valid: Any = 
     return grid.reshape(*points.shape[:-2], size, size, size)
 
 
-def squared_distance(occupied: jax.Array) -> jax.Array:
+def squared_distance(occupied: Bool[Array, "*batch N M K"]) -> Int[Array, "*batch N M K"]:
     """Squared distance in voxels from every voxel to the nearest occupied one, exactly.
 
     One min-plus product per axis (Felzenszwalb and Huttenlocher's decomposition without its envelope: at these sizes
@@ -110,14 +132,16 @@ def unreachable(shape: tuple[int, ...]) -> int:
     return sum((n - 1) ** 2 for n in shape) + 1
 
 
-def distance_transform(occupied: Any) -> jax.Array:
+def distance_transform(occupied: Shaped[AnyArray, "*batch N M K"]) -> Float[Array, "*batch N M K"]:
     """Euclidean distance in voxels to the nearest occupied voxel, [..., N, M, K]; infinity if nothing is occupied."""
     squares = squared_distance(jnp.asarray(occupied, bool))
     root = jnp.sqrt(squares.astype(_float()))
     return jnp.where(squares < unreachable(squares.shape[-3:]), root, jnp.inf)
 
 
-def gaussian_blur(volume: Any, sigma: float, truncate: float = 4.0) -> jax.Array:
+def gaussian_blur(
+    volume: Num[AnyArray, "*batch N M K"], sigma: float, truncate: float = 4.0
+) -> Float[Array, "*batch N M K"]:
     """SciPy's ``gaussian_filter`` of [..., N, M, K] volumes: reflected at the borders, cut off at ``truncate`` sigmas.
 
     Bit for bit so in float64, where SciPy itself was built without fused multiplication (its x86-64 wheels).
@@ -129,7 +153,7 @@ def gaussian_blur(volume: Any, sigma: float, truncate: float = 4.0) -> jax.Array
     return volume
 
 
-def gaussian_weights(sigma: float, truncate: float = 4.0) -> np.ndarray:
+def gaussian_weights(sigma: float, truncate: float = 4.0) -> Float[np.ndarray, " taps"]:
     """One half of the kernel, centre first, [radius + 1]; the whole kernel sums to 1. Sigma 0 gives the identity."""
     radius = int(truncate * sigma + 0.5)
     if radius == 0:
@@ -138,7 +162,7 @@ def gaussian_weights(sigma: float, truncate: float = 4.0) -> np.ndarray:
     return (whole / whole.sum())[radius:]
 
 
-def normalize(volume: jax.Array) -> jax.Array:
+def normalize(volume: Float[Array, "*batch N M K"]) -> Float[Array, "*batch N M K"]:
     """Each volume of [..., N, M, K] scaled to [0, 1]; a constant one stays as it is."""
     low, high = (f(volume, axis=(-3, -2, -1), keepdims=True) for f in (jnp.min, jnp.max))
     flat = high == low
@@ -148,7 +172,14 @@ def normalize(volume: jax.Array) -> jax.Array:
     return jnp.where(flat, volume, (volume - low) / span)
 
 
-def preprocess_avoidance(avoidance: Any, scene: Any, affordance: Any, *, movable: Any = None, start: Any = None) -> Any:
+def preprocess_avoidance(
+    avoidance: Float[AnyArray, "*batch N N N"],
+    scene: Shaped[AnyArray, "*batch N N N"],
+    affordance: Shaped[AnyArray, "*batch N N N"],
+    *,
+    movable: Shaped[AnyArray, "*batch N N N"] | None = None,
+    start: Num[AnyArray, "*batch 3"] | None = None,
+) -> Float[AnyArray, "*batch N N N"]:
     """Add the scene's occupancy to an avoidance map, but not near the targets nor near what moves.
 
     Upstream's ``_preprocess_avoidance_map``: the scene does not count closer than 15 % of the side to a target voxel,
@@ -179,13 +210,18 @@ def preprocess_avoidance(avoidance: Any, scene: Any, affordance: Any, *, movable
 
 
 @jax.jit
-def _clearance(targets: jax.Array, movable: jax.Array | None, start: jax.Array | None) -> jax.Array:
+def _clearance(
+    targets: Bool[Array, "*batch N N N"],
+    movable: Bool[Array, "*batch N N N"] | None,
+    start: Num[Array, "*batch 3"] | None,
+) -> Bool[Array, "*batch N N N"]:
     size = targets.shape[-1]
     within = int(_CLEAR_OF_TARGET * size) ** 2
     clear = squared_distance(targets) < within
     if movable is not None:
         return clear | (squared_distance(movable) < within)
-    offset = jnp.arange(size) - jnp.asarray(start)[..., None]
+    voxel = jnp.asarray(start)[..., None]
+    offset = _of_rank(voxel.ndim, jnp.arange(size))[0] - voxel
     reach = int(_CLEAR_OF_START * size)
     inside = (offset >= -reach) & (offset < reach)
     return clear | (inside[..., 0, :, None, None] & inside[..., 1, None, :, None] & inside[..., 2, None, None, :])
@@ -225,7 +261,7 @@ def _min_plus(squares: jax.Array, axis: int) -> jax.Array:
     """``out[i] = min over j of squares[j] + (i - j)²`` along an axis."""
     n, axis = squares.shape[axis], axis % squares.ndim
     at = jnp.arange(n)
-    table = ((at[:, None] - at) ** 2).astype(squares.dtype)
+    table = ((at[:, None] - at[None]) ** 2).astype(squares.dtype)
     column = [n if i == axis else 1 for i in range(squares.ndim)]
 
     def row(j: jax.Array, best: jax.Array) -> jax.Array:
@@ -234,6 +270,11 @@ def _min_plus(squares: jax.Array, axis: int) -> jax.Array:
 
     most = jnp.full_like(squares, jnp.iinfo(squares.dtype).max)
     return lax.fori_loop(0, n, row, most, unroll=min(_ROWS_AT_ONCE, n))
+
+
+def _of_rank(rank: int, *arrays: Any) -> tuple[Any, ...]:
+    """Arrays with leading axes of length 1, so that they have this rank."""
+    return tuple(array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays)
 
 
 def _float() -> Any:

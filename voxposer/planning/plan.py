@@ -1,8 +1,9 @@
-"""Plans: what a batch of hands is to do, as tensors that ``env.step_waypoints`` follows in one call.
+# ruff: noqa: F722  (shapes in annotations)
+"""Plans of a batch of hands, as tensors that ``env.step_waypoints`` executes in one call.
 
-:class:`Stop` s of each slot come in (``vecenv.manipulation.routes``); a :class:`Plan` goes out, a pytree of arrays. On
-the way grip flips are expanded: fingers need physics ticks to move, so the hand first drives to where the grip changes
-with the grip it had, then holds there while the fingers move. The grip carries over from one plan to the next.
+:class:`Stop` s of each slot come in (``vecenv.manipulation.routes``); a :class:`SubtaskPlan` goes out, a pytree of
+arrays. Changes of the grip are expanded: fingers need physics ticks to move, so the hand first drives to where the grip
+changes with the previous grip, then holds there while the fingers move. The grip carries over from plan to plan.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Array, Bool, Int, Num
 
 from vecenv.manipulation.routes import Stop
 
+AnyArray = Array | np.ndarray
 # Ticks that fingers get to open or to close.
 HOLD_TICKS = 60
 
@@ -41,7 +44,7 @@ class PlanConfig:
     lengths: int = 16
 
 
-class Row(NamedTuple):
+class PlannedWaypoint(NamedTuple):
     """One waypoint: ``pose`` xyz + wxyz [7], ``closed``, ``hold`` ticks (0 drives), ``subtask``, ``velocity``."""
 
     pose: np.ndarray
@@ -51,7 +54,7 @@ class Row(NamedTuple):
     velocity: float
 
 
-class Plan(NamedTuple):
+class SubtaskPlan(NamedTuple):
     """Waypoints of B slots, T each; a pytree.
 
     Attributes:
@@ -63,17 +66,17 @@ class Plan(NamedTuple):
         velocity: share of full speed that the velocity map asks for, [B, T].
     """
 
-    poses: Any
-    grip: Any
-    hold: Any
-    valid: Any
-    subtask: Any
-    velocity: Any
+    poses: Num[AnyArray, "B T 7"]
+    grip: Num[AnyArray, "B T"]
+    hold: Int[AnyArray, "B T"]
+    valid: Bool[AnyArray, "B T"]
+    subtask: Int[AnyArray, "B T"]
+    velocity: Num[AnyArray, "B T"]
 
 
 def expand_flips(
     stops: Sequence[Stop], closed: bool, subtask: int = 0, config: PlanConfig = PlanConfig()
-) -> tuple[list[Row], bool]:
+) -> tuple[list[PlannedWaypoint], bool]:
     """Waypoints of stops, each grip flip split in two: drive there with the grip as it was, then hold while it changes.
 
     Args:
@@ -85,10 +88,10 @@ def expand_flips(
     Returns:
         The waypoints, and the grip after the last.
     """
-    rows: list[Row] = []
+    rows: list[PlannedWaypoint] = []
     for stop in slowed(stops, config):
         pose = np.concatenate([stop.pos, stop.quat])
-        drive = Row(pose, closed, 0, subtask, stop.velocity)
+        drive = PlannedWaypoint(pose, closed, 0, subtask, stop.velocity)
         rows += [drive] * (1 + config.settle if stop.final or stop.closed != closed else 1)
         if stop.closed != closed:
             closed = stop.closed
@@ -109,11 +112,11 @@ def slowed(stops: Sequence[Stop], config: PlanConfig = PlanConfig()) -> list[Sto
     return result
 
 
-def stack(rows: Sequence[Sequence[Row]], config: PlanConfig = PlanConfig()) -> Plan:
+def stack(rows: Sequence[Sequence[PlannedWaypoint]], config: PlanConfig = PlanConfig()) -> SubtaskPlan:
     """The plan of a batch from the waypoints of each slot; a slot may have none."""
     length = max([1, *map(len, rows)])
     shape = (len(rows), -(-length // config.lengths) * config.lengths)
-    plan = Plan(
+    plan = SubtaskPlan(
         poses=np.tile(np.array([0.0, 0, 0, 1, 0, 0, 0]), (*shape, 1)),
         grip=np.zeros(shape),
         hold=np.zeros(shape, int),
@@ -128,7 +131,7 @@ def stack(rows: Sequence[Sequence[Row]], config: PlanConfig = PlanConfig()) -> P
     return plan
 
 
-def remaining(plan: Plan, ticks: np.ndarray) -> Plan:
+def remaining(plan: SubtaskPlan, ticks: Int[np.ndarray, "B T"]) -> SubtaskPlan:
     """What is left of a plan that some slots gave up on.
 
     A slot gives up after several waypoints in a row that it could not reach. It goes on where the grip changes next:

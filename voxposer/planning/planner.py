@@ -1,3 +1,4 @@
+# ruff: noqa: F722  (shapes in annotations)
 """The path planner: greedy descent through a cost volume, smoothed, cut, spaced out and ended on a target.
 
 In, for each slot: the voxel to start from, a target map, an obstacle map, and whether an object is to be moved rather
@@ -12,8 +13,6 @@ descent in ``planner_numba``, which finds the same voxels several times quicker.
 
 from __future__ import annotations
 
-import enum
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple, cast
 
@@ -22,8 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, Num, Shaped
 
-from voxposer.planning import maps
+from voxposer.planning import maps, planner_numba
+from voxposer.planning.config import Fault, PlannerConfig, neighbour_offsets, reach
 
 # A bend sharper than ``max_curvature`` counts from this waypoint on, and the path ends at this share of the way to it.
 _FIRST_BEND = 5
@@ -32,60 +33,6 @@ _KEPT_OF_BEND = 0.9
 _SMALLEST_GRID = 50
 # Slots whose maps are in memory at once, outside a CPU.
 _SLOTS_AT_ONCE = 64
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlannerConfig:
-    """Numbers of the planner, by upstream's names; lengths are in hundredths of the grid's side.
-
-    Attributes:
-        stop_threshold: the descent ends where no neighbour costs less than this much more than the voxel it is at.
-        savgol_polyorder: degree of the polynomials that smooth the path.
-        savgol_window_size: waypoints such a polynomial is fitted to; shorter paths take what they have.
-        obstacle_map_weight: weight of the blurred obstacle map, itself scaled to [0, 1].
-        max_steps: steps of the descent at most.
-        obstacle_map_gaussian_sigma: standard deviation of the blur, in voxels.
-        target_map_weight: weight of the distance to the nearest target, itself scaled to [0, 1].
-        stop_criteria: the only one there is.
-        target_spacing: inner waypoints that lie closer are thinned out.
-        max_curvature: the path is cut before the first sharper bend, 1/voxel.
-        pushing_skip_per_k: where an object is moved, every how many waypoints are kept.
-
-    Raises:
-        ValueError: naming the field that is out of range.
-    """
-
-    stop_threshold: float = 0.001
-    savgol_polyorder: int = 3
-    savgol_window_size: int = 20
-    obstacle_map_weight: float = 1
-    max_steps: int = 300
-    obstacle_map_gaussian_sigma: float = 10
-    target_map_weight: float = 2
-    stop_criteria: Literal["no_nearby_equal"] = "no_nearby_equal"
-    target_spacing: float = 1
-    max_curvature: float = 3
-    pushing_skip_per_k: int = 5
-
-    def __post_init__(self) -> None:
-        if self.stop_criteria != "no_nearby_equal":
-            raise ValueError(f"stop_criteria must be 'no_nearby_equal', got {self.stop_criteria!r}")
-        for name in ("savgol_window_size", "max_steps", "pushing_skip_per_k"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("savgol_polyorder", "obstacle_map_gaussian_sigma", "target_spacing"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-
-
-class Fault(enum.IntEnum):
-    """Why a slot has no path."""
-
-    NONE = 0
-    NO_TARGET = 1
-    """No voxel of the target map equals 1."""
-    NOT_FINITE = 2
-    """NaN or infinity in a map or in the start."""
 
 
 class Paths(NamedTuple):
@@ -99,19 +46,19 @@ class Paths(NamedTuple):
         fault: ``Fault`` of each slot, int32 [B].
     """
 
-    raw: jax.Array
-    raw_length: jax.Array
-    path: jax.Array
-    path_length: jax.Array
-    fault: jax.Array
+    raw: Int[Array, "B steps 3"]
+    raw_length: Int[Array, " B"]
+    path: Float[Array, "B waypoints 3"]
+    path_length: Int[Array, " B"]
+    fault: Int[Array, " B"]
 
 
 def optimize_paths(
-    start: Any,
-    target: Any,
-    obstacle: Any,
-    object_centric: Any,
-    config: PlannerConfig = PlannerConfig(),
+    start: Num[maps.AnyArray, "B 3"],
+    target: Shaped[maps.AnyArray, "B N N N"],
+    obstacle: Shaped[maps.AnyArray, "B N N N"],
+    object_centric: Shaped[maps.AnyArray, " B"],
+    config: PlannerConfig = PlannerConfig(),  # noqa: B008  (frozen)
     *,
     engine: Literal["auto", "jax", "numba"] = "auto",
 ) -> Paths:
@@ -164,24 +111,11 @@ def _on_cpu(arrays: tuple[Any, ...]) -> bool:
     return all(platform == "cpu" for platform in placed or [jax.default_backend()])
 
 
-def reach(size: int) -> int:
-    """How many voxels a step may go along each axis."""
-    return int(2 * size / 100)
-
-
-def neighbour_offsets(size: int) -> np.ndarray:
-    """Offsets of a voxel's surroundings, itself included, in the order of ``np.unique``, [K, 3]."""
-    steps = np.arange(-reach(size), reach(size) + 1)
-    return np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
 # ----------------------------------------------------------------------------------------------------------------------
-# The two ways to the raw path.
+# The two engines of the raw path.
 
 
 def _with_numba(start: Any, target: Any, obstacle: Any, planar: Any, config: PlannerConfig) -> Paths:
-    from voxposer.planning import planner_numba
-
     target, obstacle, planar = np.asarray(target), np.asarray(obstacle), np.asarray(planar, bool)
     raw, length, fault = planner_numba.descend(np.asarray(start), target, obstacle, planar, config)
     path, path_length = _shape(raw, length, config, target.shape[-1])
@@ -224,14 +158,18 @@ def _plan(start: jax.Array, target: jax.Array, obstacle: jax.Array, planar: jax.
     return _finish(raw, length, fault, path, path_length, end, snap, planar, config, size)
 
 
-def _faults(start: jax.Array, target: jax.Array, obstacle: jax.Array) -> jax.Array:
+def _faults(
+    start: Num[Array, "B 3"], target: Shaped[Array, "B N N N"], obstacle: Float[Array, "B N N N"]
+) -> Int[Array, " B"]:
     volume = (-3, -2, -1)
     finite = jnp.isfinite(start).all(-1) & jnp.isfinite(target).all(volume) & jnp.isfinite(obstacle).all(volume)
     lost = ~(target == 1).any(volume)
     return jnp.where(finite, jnp.where(lost, Fault.NO_TARGET, Fault.NONE), Fault.NOT_FINITE).astype(jnp.int32)
 
 
-def cost_map(target: jax.Array, obstacle: jax.Array, config: PlannerConfig) -> jax.Array:
+def cost_map(
+    target: Bool[Array, "*batch N N N"], obstacle: Float[Array, "*batch N N N"], config: PlannerConfig
+) -> Float[Array, "*batch N N N"]:
     """What a voxel costs: far from ``target`` (bool) and near to ``obstacle``, [..., N, N, N] in [0, 1]."""
     far = maps.normalize(jnp.sqrt(maps.squared_distance(target).astype(obstacle.dtype)))
     near = maps.normalize(maps.gaussian_blur(obstacle, config.obstacle_map_gaussian_sigma))
@@ -254,8 +192,8 @@ class _Descent(NamedTuple):
 
 
 def _descend(
-    start: jax.Array, cost: jax.Array, planar: jax.Array, config: PlannerConfig
-) -> tuple[jax.Array, jax.Array]:
+    start: Int[Array, "B 3"], cost: Float[Array, "B N N N"], planar: Bool[Array, " B"], config: PlannerConfig
+) -> tuple[Int[Array, "B steps 3"], Int[Array, " B"]]:
     """Raw paths int32 [G, max_steps + 1, 3] and their lengths [G], all slots in step.
 
     A batched loop written out: under ``vmap`` every step would copy the volumes to select the slots still moving.
@@ -275,7 +213,7 @@ def _descend(
         # Upstream takes out the voxel itself before clipping to the grid, and clipping at a border brings it back.
         edge = (here == 0) | (here == size - 1)
         own = edge[:, :2].any(-1) | (edge[:, 2] & ~flat)
-        allowed = (level | ~flat[:, None]) & ((jnp.arange(len(offsets)) != middle) | own[:, None])
+        allowed = (level[None] | ~flat[:, None]) & ((jnp.arange(len(offsets)) != middle)[None] | own[:, None])
         return jnp.where(allowed, around, jnp.inf)
 
     def step(d: _Descent) -> _Descent:
@@ -300,15 +238,15 @@ def _descend(
         length=jnp.ones(len(start), jnp.int32),
     )
     end = lax.while_loop(lambda d: (d.step < config.max_steps) & d.active.any(), step, first)
-    behind = jnp.arange(raw.shape[1]) >= end.length[:, None]
+    behind = jnp.arange(raw.shape[1])[None] >= end.length[:, None]
     return jnp.where(behind[..., None], end.here[:, None], end.raw), end.length
 
 
-def _ends(target: jax.Array, last: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _ends(target: Shaped[Array, "B N N N"], last: Float[Array, "B 3"]) -> tuple[Int[Array, "B 3"], Bool[Array, " B"]]:
     """The target voxel nearest to ``last`` [G, 3], the first of several, and whether the path has to be led there."""
     size = target.shape[-1]
     voxel = jnp.clip(jnp.round(last), 0, size - 1).astype(jnp.int32)
-    x, y, z = ((jnp.arange(size) - voxel[:, i, None]).astype(jnp.int64) ** 2 for i in range(3))
+    x, y, z = ((jnp.arange(size)[None] - voxel[:, i, None]).astype(jnp.int64) ** 2 for i in range(3))
     squares = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :]
     # Distance first, then place in the grid, in one number: its minimum is the first of the nearest.
     place = jnp.arange(size**3).reshape(1, size, size, size)
@@ -366,7 +304,7 @@ def _finish(
     return Paths(raw, raw_length, path.astype(jnp.float32), length, fault)
 
 
-def smooth(path: jax.Array, length: jax.Array, window: int, degree: int) -> jax.Array:
+def smooth(path: Float[Array, "L 3"], length: Int[Array, ""], window: int, degree: int) -> Float[Array, "L 3"]:
     """SciPy's ``savgol_filter(path[:length], min(length, window), min(degree, ...))``, its ``"interp"`` ends included.
 
     With an even window the inner waypoints are estimates half a sample further on, as SciPy's are.
@@ -386,7 +324,7 @@ def smooth(path: jax.Array, length: jax.Array, window: int, degree: int) -> jax.
     head, tail = i < half, i >= length - half
     begin = jnp.where(head, 0, jnp.where(tail, length - width, i - (width - 1) // 2))
     rows = jnp.where((head | tail)[:, None], fitted[width, jnp.clip(i - begin, 0, window - 1)], inner[width])
-    samples = path[jnp.minimum(begin[:, None] + jnp.arange(window), len(path) - 1)]
+    samples = path[jnp.minimum(begin[:, None] + jnp.arange(window)[None], len(path) - 1)]
     return (rows[..., None] * samples).sum(axis=1)
 
 
@@ -403,14 +341,14 @@ def _savgol_tables(window: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     return fitted, inner
 
 
-def _gradient(path: jax.Array, length: jax.Array) -> jax.Array:
+def _gradient(path: Float[Array, "L 3"], length: Int[Array, ""]) -> Float[Array, "L 3"]:
     """``np.gradient`` of the first ``length`` entries along axis 0."""
     i = jnp.arange(len(path))
     before, after = jnp.maximum(i - 1, 0), jnp.minimum(i + 1, length - 1)
     return (path[after] - path[before]) / jnp.maximum(after - before, 1)[:, None]
 
 
-def _cut(path: jax.Array, length: jax.Array, sharpest: float) -> jax.Array:
+def _cut(path: Float[Array, "L 3"], length: Int[Array, ""], sharpest: float) -> Int[Array, ""]:
     """Length of a path [L, 3] that ends shortly before its first bend sharper than ``sharpest``."""
     velocity = _gradient(path, length)
     turn = jnp.cross(velocity, _gradient(velocity, length))
@@ -422,7 +360,9 @@ def _cut(path: jax.Array, length: jax.Array, sharpest: float) -> jax.Array:
     return jnp.where(sharp.any(), kept[jnp.argmax(sharp)], length)
 
 
-def _space_out(path: jax.Array, length: jax.Array, spacing: int) -> tuple[jax.Array, jax.Array]:
+def _space_out(
+    path: Float[Array, "L 3"], length: Int[Array, ""], spacing: int
+) -> tuple[Float[Array, "L 3"], Int[Array, ""]]:
     """Of the inner waypoints keep every k-th, so that they lie about ``spacing`` apart, and both ends."""
     inner = length - 2
     gap = jnp.sqrt(((path[1:] - path[:-1]) ** 2).sum(-1))
@@ -437,14 +377,14 @@ def _space_out(path: jax.Array, length: jax.Array, spacing: int) -> tuple[jax.Ar
     return path[source], count + 2
 
 
-def _every(path: jax.Array, length: jax.Array, k: int) -> tuple[jax.Array, jax.Array]:
+def _every(path: Float[Array, "L 3"], length: Int[Array, ""], k: int) -> tuple[Float[Array, "L 3"], Int[Array, ""]]:
     """``path[k:-1:k]`` and the last waypoint, which is repeated behind."""
     count = jnp.maximum(length - 2, 0) // k
     i = jnp.arange(len(path))
     return path[jnp.where(i < count, jnp.minimum((i + 1) * k, length - 1), length - 1)], count + 1
 
 
-def _last(path: jax.Array, length: jax.Array) -> jax.Array:
+def _last(path: Float[Array, "B L 3"], length: Int[Array, " B"]) -> Float[Array, "B 3"]:
     """Where each path ends, [B, 3], the nearest billionth of a voxel.
 
     The window is a few samples of whole numbers, so a smoothed path does end half-way between voxels, give or take the

@@ -23,7 +23,7 @@ import numpy as np
 from vecenv.util.compiled import compile_function, part
 from vecenv.util.cores import usable_cores
 from voxposer.planning import maps
-from voxposer.planning.planner import Fault, PlannerConfig, neighbour_offsets
+from voxposer.planning.config import Fault, PlannerConfig, neighbour_offsets
 
 # Rows of the volume blurred together: longer inner loops, and still in a core's cache.
 _STRIP = 4

@@ -1,3 +1,4 @@
+# ruff: noqa: F722  (shapes in annotations)
 """Pushing: which push moves a thing closest to where it should go, and the hand's waypoints for it.
 
 In, for each slot: the thing's surface points and the place its centre is to reach, world frame, metres. Out: ``Push``
@@ -24,8 +25,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Num, Shaped
 
 from vecenv.util.rotations import mat_to_quat, quat_mul, safe_norm
+from voxposer.planning.maps import AnyArray
 
 # Closer than this a contact has no direction to the target.
 _NO_WAY = 1e-6
@@ -80,17 +83,17 @@ class Push(NamedTuple):
 
     Attributes:
         contact: where the hand touches, [B, 3].
-        direction: unit vector, [B, 3]; zero where the thing is at its target already or has no points.
-        distance: metres along it, [B].
-        cost: predicted distance of the thing's centre from the target, [B]; infinite without points.
+        direction: unit vector, [B, 3]; zero where the object is at its target or has no points.
+        distance: length of the push, metres, [B].
+        cost: predicted distance of the object's centre from the target, [B]; infinite without points.
         predicted: where the model expects the centre, [B, 3].
     """
 
-    contact: jax.Array
-    direction: jax.Array
-    distance: jax.Array
-    cost: jax.Array
-    predicted: jax.Array
+    contact: Float[Array, "B 3"]
+    direction: Float[Array, "B 3"]
+    distance: Float[Array, " B"]
+    cost: Float[Array, " B"]
+    predicted: Float[Array, "B 3"]
 
 
 class PushWaypoints(NamedTuple):
@@ -102,28 +105,28 @@ class PushWaypoints(NamedTuple):
         velocity: share of the free speed on the way to each, [B, 5].
     """
 
-    pose: jax.Array
-    grip: jax.Array
-    velocity: jax.Array
+    pose: Float[Array, "B 5 7"]
+    grip: Float[Array, "B 5"]
+    velocity: Float[Array, "B 5"]
 
 
 @partial(jax.jit, static_argnames="config")
 def best_push(
-    points: Any,
-    target: Any,
-    key: jax.Array,
+    points: Num[AnyArray, "B M 3"],
+    target: Num[AnyArray, "B 3"],
+    key: Shaped[Array, ...],
     config: PushConfig = PushConfig(),
     *,
-    valid: Any = None,
-    normals: Any = None,
-    touchable: Any = None,
-    lowest: Any = None,
-    highest: Any = None,
+    valid: Bool[AnyArray, "B M"] | None = None,
+    normals: Num[AnyArray, "B M 3"] | None = None,
+    touchable: Shaped[AnyArray, "B M"] | None = None,
+    lowest: Num[AnyArray, " B"] | float | None = None,
+    highest: Num[AnyArray, " B"] | float | None = None,
 ) -> Push:
     """The push that is predicted to bring each thing's centre closest to its target.
 
     Args:
-        points: surface of the thing, [B, M, 3].
+        points: surface of the object, metres, [B, M, 3].
         target: where its centre (the mean of its points) should come to be, [B, 3].
         key: one ``jax.random`` key, or one a slot, [B]: then a slot's push does not depend on the batch it is in.
         config: numbers of the search.
@@ -153,17 +156,18 @@ def best_push(
     free = usable if touchable is None else usable & jnp.asarray(touchable, bool)
     free = jnp.where(free.any(-1, keepdims=True), free, usable)
     search = jax.vmap(partial(_search, config=config), in_axes=(0, 0, 0, None if normals is None else 0, 0, 0, 0, 0))
+    normals = None if normals is None else jnp.asarray(normals)
     return search(points, usable, free, normals, target, _keys(key, slots), low, high)
 
 
 def push_costs(
-    centre: jax.Array,
-    target: jax.Array,
-    contact: jax.Array,
-    direction: jax.Array,
-    distance: jax.Array,
-    moves: jax.Array | None = None,
-) -> tuple[jax.Array, jax.Array]:
+    centre: Float[Array, " 3"],
+    target: Float[Array, " 3"],
+    contact: Float[Array, "S 3"],
+    direction: Float[Array, "S 3"],
+    distance: Float[Array, " S"],
+    moves: Bool[Array, " S"] | None = None,
+) -> tuple[Float[Array, "S 3"], Float[Array, " S"]]:
     """The pushing model for S samples: the thing's centre moves along, unless the hand moves away from it.
 
     Args:
@@ -178,12 +182,14 @@ def push_costs(
         Predicted centres [S, 3] and their distances to the target [S].
     """
     if moves is None:
-        moves = ((centre - contact) * direction).sum(-1) >= 0
-    predicted = centre + jnp.where(moves, distance, 0)[:, None] * direction
-    return predicted, safe_norm(predicted - target)
+        moves = ((centre[None] - contact) * direction).sum(-1) >= 0
+    predicted = centre[None] + jnp.where(moves, distance, 0)[:, None] * direction
+    return predicted, safe_norm(predicted - target[None])
 
 
-def push_waypoints(push: Push, config: PushConfig = PushConfig(), *, hand: Any = HAND_DOWN) -> PushWaypoints:
+def push_waypoints(
+    push: Push, config: PushConfig = PushConfig(), *, hand: Num[AnyArray, "*#B 4"] | tuple[float, ...] = HAND_DOWN
+) -> PushWaypoints:
     """Waypoints of the closed hand for each push.
 
     Args:
@@ -195,26 +201,26 @@ def push_waypoints(push: Push, config: PushConfig = PushConfig(), *, hand: Any =
     Returns:
         Poses of the grip site with the hand's orientation: z out of the fingers, y across them, as ``step_ee_pose``.
     """
-    along, up = push.direction, jnp.array([0.0, 0.0, config.lift])
+    along, up = push.direction, jnp.array([[0.0, 0.0, config.lift]])
     start = push.contact - config.start_distance * along
     end = push.contact + push.distance[:, None] * along
     rest = push.contact - config.retreat * config.start_distance * along
     pos = jnp.stack([start + up, start, end, rest, rest + up], axis=1)
     quat = jnp.broadcast_to(_hand_quat(along, config.slant, jnp.asarray(hand))[:, None], (*pos.shape[:2], 4))
     speeds = jnp.array([1.0, 1.0, config.push_speed, config.retreat_speed, 1.0])
-    velocity = jnp.broadcast_to(speeds, pos.shape[:2])
+    velocity = jnp.broadcast_to(speeds[None], pos.shape[:2])
     return PushWaypoints(jnp.concatenate([pos, quat], axis=-1), jnp.ones_like(velocity), velocity)
 
 
 def _search(
-    points: jax.Array,
-    usable: jax.Array,
-    free: jax.Array,
-    normals: jax.Array | None,
-    target: jax.Array,
-    key: jax.Array,
-    low: jax.Array,
-    high: jax.Array,
+    points: Num[Array, "M 3"],
+    usable: Bool[Array, " M"],
+    free: Bool[Array, " M"],
+    normals: Num[Array, "M 3"] | None,
+    target: Num[Array, " 3"],
+    key: Shaped[Array, ...],
+    low: Float[Array, ""],
+    high: Float[Array, ""],
     config: PushConfig,
 ) -> Push:
     """One slot: points [M, 3], which count [M] and may be touched [M], normals or None, target [3], heights."""
@@ -226,7 +232,7 @@ def _search(
     chosen = _draw(which, free, points[:, 2], low, high, config.num_samples)
     contact = points[chosen]
     contact = contact.at[:, 2].set(jnp.clip(contact[:, 2], low, high))
-    direction = _unit((target - contact) * across)
+    direction = _unit((target[None] - contact) * across[None])
     distance = jax.random.uniform(
         how_far, (config.num_samples,), minval=config.min_distance, maxval=config.max_distance
     )
@@ -244,8 +250,13 @@ def _search(
 
 
 def _draw(
-    key: jax.Array, usable: jax.Array, heights: jax.Array, low: jax.Array, high: jax.Array, count: int
-) -> jax.Array:
+    key: Shaped[Array, ...],
+    usable: Bool[Array, " M"],
+    heights: Num[Array, " M"],
+    low: Float[Array, ""],
+    high: Float[Array, ""],
+    count: int,
+) -> Int[Array, " count"]:
     """``count`` indices of points, uniformly among those at an allowed height; among all if there are none there."""
     within = usable & (heights >= low) & (heights <= high)
     chosen = jnp.cumsum(jnp.where(within.any(), within, usable))
@@ -254,31 +265,36 @@ def _draw(
 
 
 def _behind(
-    points: jax.Array, usable: jax.Array, contact: jax.Array, direction: jax.Array, config: PushConfig
-) -> jax.Array:
+    points: Num[Array, "M 3"],
+    usable: Bool[Array, " M"],
+    contact: Float[Array, " 3"],
+    direction: Float[Array, " 3"],
+    config: PushConfig,
+) -> Float[Array, ""]:
     """How far the thing reaches back from a contact, against the push: in the hand's way, not before its start."""
-    offset = points - contact
-    back = -(offset * direction).sum(-1)
-    aside = offset + back[:, None] * direction
+    offset = points - contact[None]
+    back = -(offset * direction[None]).sum(-1)
+    aside = offset + back[:, None] * direction[None]
     met = usable & (safe_norm(aside[:, :2]) <= config.hand_width / 2) & (back < config.start_distance)
     met &= offset[:, 2] > -config.tip
     return jnp.max(jnp.where(met, back, 0), initial=0)
 
 
-def _hand_quat(along: jax.Array, slant: float, hand: jax.Array) -> jax.Array:
+def _hand_quat(along: Float[Array, "B 3"], slant: float, hand: Float[Array, "*#B 4"]) -> Float[Array, "B 4"]:
     """Orientation wxyz [B, 4] of a hand whose fingers point down, slanted towards ``along`` [B, 3], y across it."""
-    level = along * jnp.array([1.0, 1.0, 0.0])
+    level = along * jnp.array([[1.0, 1.0, 0.0]])
     # A push straight down has no heading; the hand then faces away from the robot's base.
-    level = jnp.where(safe_norm(level)[:, None] > _NO_WAY, _unit(level), jnp.array([1.0, 0.0, 0.0]))
-    out = jnp.sin(slant) * level - jnp.cos(slant) * jnp.array([0.0, 0.0, 1.0])
-    left = jnp.cross(jnp.array([0.0, 0.0, 1.0]), level)
+    level = jnp.where(safe_norm(level)[:, None] > _NO_WAY, _unit(level), jnp.array([[1.0, 0.0, 0.0]]))
+    out = jnp.sin(slant) * level - jnp.cos(slant) * jnp.array([[0.0, 0.0, 1.0]])
+    left = jnp.cross(jnp.array([[0.0, 0.0, 1.0]]), level)
     quat = mat_to_quat(jnp.stack([jnp.cross(left, out), left, out], axis=-1))
-    turned = quat_mul(quat, jnp.array([0.0, 0.0, 0.0, 1.0]))
+    turned = quat_mul(quat, jnp.array([[0.0, 0.0, 0.0, 1.0]]))
+    hand = jnp.broadcast_to(hand, quat.shape)
     nearer = jnp.abs((quat * hand).sum(-1)) >= jnp.abs((turned * hand).sum(-1))
     return jnp.where(nearer[:, None], quat, turned)
 
 
-def _unit(vectors: jax.Array) -> jax.Array:
+def _unit(vectors: Float[Array, "*B 3"]) -> Float[Array, "*B 3"]:
     """Vectors [..., 3] scaled to length 1, zero where there is no direction."""
     length = safe_norm(vectors)[..., None]
     return jnp.where(length > _NO_WAY, vectors / jnp.where(length > _NO_WAY, length, 1), 0)

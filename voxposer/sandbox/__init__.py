@@ -1,1 +1,1 @@
-"""Running programs that nobody has vetted, within limits of time, memory and reach."""
+"""Runs untrusted programs within limits of time, memory and access."""

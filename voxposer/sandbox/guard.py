@@ -1,4 +1,4 @@
-"""What a model-written program may hold, and how much of it: kinds of values, limits, and the meters that count.
+"""Which values a program may hold, and how much it may use: kinds of values, limits, and the meters that count.
 
 In: values as they come into being while ``voxposer.sandbox`` interprets a program. Out: the same values, or a
 ``Refusal`` with the rule it breaks. Sizes are checked before anything is allocated. Nothing here knows about syntax;
@@ -28,10 +28,10 @@ _DIMENSIONS = 8
 
 
 class Refusal(Exception):
-    """A program asked for something it may not have.
+    """A program broke a rule.
 
     Attributes:
-        rule: short name of the rule, one of ``voxposer.sandbox.RULES``.
+        rule: short name of the rule, one of ``voxposer.sandbox.syntax.RULES``.
         reason: what was asked and what would be right.
     """
 
@@ -41,7 +41,7 @@ class Refusal(Exception):
 
 
 class HostFault(Exception):
-    """An error that is no fault of the program: it passes through the interpreter unchanged."""
+    """An error of the host, not of the program: it passes through the interpreter unchanged."""
 
 
 class Record(ABC):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from voxposer.sandbox.guard import ELEMENTS_A_STEP, Guard, RecordList, Refusal, refuse_kind
-from voxposer.sandbox.vocabulary import APPENDED_BYTES, array, hashable, number_of, numbers
+from voxposer.sandbox.values import APPENDED_BYTES, array, hashable, number_of, numbers
 
 
 def subscript(guard: Guard, value: Any, index: Any) -> Any:

@@ -1,16 +1,13 @@
-"""Programs that a language model wrote, run as what they are: hostile until shown otherwise.
+"""Runs programs that a language model wrote, which are not trusted.
 
 In: source text, functions it may call and variables it starts with. Out: the value it returned and its variables, or a
 ``SandboxError`` naming the line and the rule it broke.
 
-The source is parsed to a syntax tree, everything outside a small language is refused before anything runs, and the
-tree is interpreted here: Python never executes the program, so there is no frame, class or module it could reach. Every
-value passes through a ``voxposer.sandbox.guard.Guard``, every function and method is one of
-``voxposer.sandbox.vocabulary``'s or the host's, and steps, calls, time, memory, sizes and nesting are bounded.
-
-The language: assignment (also to several names, and to places in arrays, lists and dictionaries), arithmetic,
-comparisons, and/or/not, conditional expressions, if, for, while, break, continue, pass, return, lists, tuples,
-dictionaries, list comprehensions, f-strings with plain formats, indexing and slicing, fields of observations, calls.
+The source is parsed to a syntax tree, everything outside a small language is refused before anything runs
+(``voxposer.sandbox.syntax``), and the tree is interpreted here: Python never executes the program, so there is no
+frame, class or module it could reach. Every value passes through a ``voxposer.sandbox.guard.Guard``, every function and
+method is the host's or listed in ``voxposer.sandbox.vocabulary``, and steps, calls, time, memory, sizes and nesting are
+bounded.
 """
 
 from __future__ import annotations
@@ -18,68 +15,16 @@ from __future__ import annotations
 import ast
 import difflib
 import enum
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from voxposer.sandbox import indexing, vocabulary
-from voxposer.sandbox.guard import Budget, DType, Guard, HostFault, Limits, Opaque, Record, RecordList, Refusal, kind_of
-
-__all__ = [
-    "RULES",
-    "Budget",
-    "HostFault",
-    "Limits",
-    "Opaque",
-    "Outcome",
-    "Program",
-    "Record",
-    "RecordList",
-    "SandboxError",
-    "parse",
-]
-
-RULES: Mapping[str, str] = MappingProxyType(
-    {
-        "syntax": "the source is Python of the small language",
-        "imports": "nothing is imported; what a program needs is there",
-        "definitions": "no functions, lambdas or classes",
-        "underscores": "no names that start with an underscore",
-        "formats": "f-strings hold values and plain number formats",
-        "names": "a name is a variable, a given function or one of the vocabulary's",
-        "attributes": "attributes are an observation's fields, or an array's shape, ndim, size and T, and only read",
-        "functions": "functions are called by their names and are no values",
-        "values": "values are numbers, text, arrays of numbers, lists, tuples, dictionaries, observations and maps",
-        "types": "operators and functions get values they are made for",
-        "value": "operations have a result",
-        "call": "a given function did what it was asked",
-        "return": "a program that should return a value does",
-        "nesting": "syntax, calls and lists nest a few levels",
-        "size": "integers, text and lists are small",
-        "memory": "arrays are of a map's size, a few at a time",
-        "steps": "a program ends after a bounded number of steps",
-        "calls": "a program calls the host a bounded number of times",
-        "time": "a program ends after a bounded time",
-    }
-)
-
-
-class SandboxError(ValueError):
-    """A program that cannot be run, or not on.
-
-    Attributes:
-        line: line of the source, from 1.
-        rule: the rule it breaks, a key of ``RULES``.
-        reason: what was found and what would be right.
-    """
-
-    def __init__(self, line: int, rule: str, reason: str) -> None:
-        super().__init__(f"line {line}: {reason} [rule: {rule}]")
-        self.line, self.rule, self.reason = line, rule, reason
+from voxposer.sandbox import indexing, operators, values, vocabulary
+from voxposer.sandbox.guard import Budget, DType, Guard, Limits, Record, Refusal, kind_of
+from voxposer.sandbox.syntax import SYMBOLS, SandboxError, checked_tree, reads
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,202 +80,13 @@ class Program:
             return _Run(self, functions, dict(variables or {}), returns, Guard(budget)).outcome()
 
 
-# The small language: nodes of the syntax tree that a program may contain.
-_STATEMENTS = (ast.Assign, ast.AugAssign, ast.Expr, ast.If, ast.For, ast.While, ast.Return, ast.Pass)
-_JUMPS = (ast.Break, ast.Continue)
-_EXPRESSIONS = (
-    *(ast.Constant, ast.Name, ast.Attribute, ast.Subscript, ast.Slice, ast.Call, ast.keyword),
-    *(ast.BinOp, ast.UnaryOp, ast.BoolOp, ast.Compare, ast.IfExp),
-    *(ast.List, ast.Tuple, ast.Dict, ast.ListComp, ast.comprehension, ast.JoinedStr, ast.FormattedValue),
-)
-_CONTEXTS = (ast.Load, ast.Store, ast.boolop, ast.cmpop, ast.unaryop)
-_SYMBOLS: dict[type[ast.AST], str] = {
-    ast.Add: "+",
-    ast.Sub: "-",
-    ast.Mult: "*",
-    ast.Div: "/",
-    ast.FloorDiv: "//",
-    ast.Mod: "%",
-    ast.Pow: "**",
-    ast.MatMult: "@",
-    ast.BitAnd: "&",
-    ast.BitOr: "|",
-    ast.BitXor: "^",
-    ast.Eq: "==",
-    ast.NotEq: "!=",
-    ast.Lt: "<",
-    ast.LtE: "<=",
-    ast.Gt: ">",
-    ast.GtE: ">=",
-    ast.Is: "is",
-    ast.IsNot: "is not",
-    ast.In: "in",
-    ast.NotIn: "not in",
-    ast.USub: "-",
-    ast.UAdd: "+",
-    ast.Invert: "~",
-    ast.Not: "not",
-}
-_OPERATORS = tuple(_SYMBOLS)
-_ALLOWED = _STATEMENTS + _JUMPS + _EXPRESSIONS + _CONTEXTS + _OPERATORS
-
-_REFUSED: tuple[tuple[tuple[type[ast.AST], ...], str, str], ...] = (
-    ((ast.Import, ast.ImportFrom), "imports", "an import statement; np and the given functions are there without"),
-    (
-        (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda, ast.arguments, ast.arg),
-        "definitions",
-        "a definition of a function or class; write the statements themselves",
-    ),
-    ((ast.GeneratorExp, ast.SetComp, ast.DictComp), "syntax", "only list comprehensions are allowed; put it in [ ]"),
-    ((ast.Yield, ast.YieldFrom, ast.Await), "definitions", "a generator or coroutine"),
-)
-
-# A fill character is not allowed, and a width of two digits at most.
-_FORMAT = re.compile(r"[<>^]?[+ ]?0?\d{0,2}(\.\d{1,2})?[dfegs%]?")
-_STARRED = "a starred argument or item; write them out"
-
-
 def parse(source: str, *, limits: Limits = Limits()) -> Program:  # noqa: B008  (frozen)
-    """The program a source text says, checked to be of the small language.
+    """The program of a source text, checked to be of the small language.
 
     Raises:
-        SandboxError: it is no Python, or more of it than is allowed.
+        SandboxError: it is not Python, or more of it than is allowed.
     """
-    if len(source) > limits.source_chars:
-        raise SandboxError(1, "size", f"{len(source)} characters of source; {limits.source_chars} are allowed")
-    tree = _tree(source)
-    for node, line, depth in _walk(tree):
-        if depth > limits.nesting:
-            raise SandboxError(line, "nesting", f"syntax more than {limits.nesting} levels deep")
-        try:
-            _check(node)
-        except Refusal as refusal:
-            raise SandboxError(line, refusal.rule, refusal.reason) from None
-    return Program(source=source, body=tuple(tree.body), limits=limits)
-
-
-def _tree(source: str) -> ast.Module:
-    try:
-        return ast.parse(source)
-    except SyntaxError as error:
-        raise SandboxError(error.lineno or 1, "syntax", f"not Python: {error.msg}") from None
-    except (RecursionError, MemoryError):  # Python's parser gives up on deep nesting with either
-        raise SandboxError(1, "nesting", "syntax nested too deep to parse") from None
-    except ValueError as error:  # NUL bytes and lone surrogates, by version of Python
-        raise SandboxError(1, "syntax", f"not Python: {error}") from None
-
-
-def _walk(tree: ast.Module) -> Iterator[tuple[ast.AST, int, int]]:
-    """Nodes with their lines and depths, in the order of the source."""
-    pending: list[tuple[ast.AST, int, int]] = [(node, 1, 1) for node in reversed(tree.body)]
-    while pending:
-        node, line, depth = pending.pop()
-        line = getattr(node, "lineno", line)
-        yield node, line, depth
-        children = list(ast.iter_child_nodes(node))
-        pending.extend((child, line, depth + 1) for child in reversed(children))
-
-
-def _check(node: ast.AST) -> None:
-    """Refuse a node that is not of the small language; its children are checked on their own."""
-    for types, rule, reason in _REFUSED:
-        if isinstance(node, types):
-            raise Refusal(rule, reason)
-    if isinstance(node, ast.Starred):
-        raise Refusal("syntax", _STARRED)
-    if not isinstance(node, _ALLOWED):
-        raise Refusal("syntax", f"{_called(node)} is not part of the language")
-    check = _CHECKS.get(type(node))
-    if check is not None:
-        check(node)
-
-
-def _called(node: ast.AST) -> str:
-    """What people call a kind of node: "an assert statement"."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(node).__name__).lower()
-    return f"a '{words}'"
-
-
-def _require_public(name: str) -> None:
-    if name.startswith("_") and name != "_":
-        raise Refusal("underscores", f"{name!r}: names that start with an underscore are out of reach")
-
-
-def _check_constant(node: ast.Constant) -> None:
-    value = node.value
-    if value is not Ellipsis and not isinstance(value, (str, bool, int, float, type(None))):
-        raise Refusal("values", f"{type(value).__name__} is no kind of value a program may hold")
-    if isinstance(value, str) and any("\ud800" <= character <= "\udfff" or character == "\0" for character in value):
-        raise Refusal("values", "text with characters that no encoding has")
-
-
-def _check_call(node: ast.Call) -> None:
-    if any(keyword.arg is None for keyword in node.keywords):
-        raise Refusal("syntax", _STARRED)
-    if not isinstance(node.func, (ast.Name, ast.Attribute)):
-        raise Refusal("functions", "only functions and methods with a name can be called")
-
-
-def _check_targets(targets: Iterable[ast.expr]) -> None:
-    for target in targets:
-        if isinstance(target, ast.Attribute):
-            raise Refusal("attributes", f"attribute {target.attr!r} is assigned to; attributes are only read")
-        if isinstance(target, ast.Starred):
-            raise Refusal("syntax", _STARRED)
-
-
-def _check_format(node: ast.FormattedValue) -> None:
-    if node.conversion not in (-1, ord("s")):
-        raise Refusal("formats", "a conversion in an f-string; write {value}")
-    if node.format_spec is not None:
-        values = node.format_spec.values if isinstance(node.format_spec, ast.JoinedStr) else [node.format_spec]
-        parts = [value.value for value in values if isinstance(value, ast.Constant)]
-        spec = "".join(str(part) for part in parts)
-        if len(parts) < len(values) or not _FORMAT.fullmatch(spec):
-            raise Refusal("formats", f"the format {spec!r} in an f-string; write one such as .2f or d")
-
-
-def _check_comparison(node: ast.Compare) -> None:
-    for operator, side in zip(node.ops, node.comparators, strict=True):
-        if isinstance(operator, (ast.Is, ast.IsNot)) and not isinstance(side, ast.Constant):
-            raise Refusal("syntax", "'is' compares with None, True and False only")
-
-
-def _check_loop(node: ast.For | ast.While) -> None:
-    if node.orelse:
-        raise Refusal("syntax", "'else' after a loop is not part of the language")
-    if isinstance(node, ast.For):
-        _check_targets([node.target])
-
-
-def _check_comprehension(node: ast.comprehension) -> None:
-    if node.is_async:
-        raise Refusal("definitions", "a generator or coroutine")
-    _check_targets([node.target])
-
-
-def _check_dict(node: ast.Dict) -> None:
-    if any(key is None for key in node.keys):
-        raise Refusal("syntax", _STARRED)
-
-
-_CHECKS: dict[type[ast.AST], Callable[[Any], None]] = {
-    ast.Name: lambda node: _require_public(node.id),
-    ast.Attribute: lambda node: _require_public(node.attr),
-    ast.keyword: lambda node: _require_public(node.arg or ""),
-    ast.Constant: _check_constant,
-    ast.Call: _check_call,
-    ast.Assign: lambda node: _check_targets(node.targets),
-    ast.AugAssign: lambda node: _check_targets([node.target]),
-    ast.Tuple: lambda node: _check_targets(node.elts) if isinstance(node.ctx, ast.Store) else None,
-    ast.List: lambda node: _check_targets(node.elts) if isinstance(node.ctx, ast.Store) else None,
-    ast.FormattedValue: _check_format,
-    ast.Compare: _check_comparison,
-    ast.For: _check_loop,
-    ast.While: _check_loop,
-    ast.comprehension: _check_comprehension,
-    ast.Dict: _check_dict,
-}
+    return Program(source=source, body=tuple(checked_tree(source, limits).body), limits=limits)
 
 
 class _Jump(enum.Enum):
@@ -364,7 +120,7 @@ class _Run:
     ) -> None:
         self._program, self._functions, self._variables, self._guard = program, functions, variables, guard
         self._returns = returns
-        self._returns_at_once = returns is not None and not _reads(program.body, returns)
+        self._returns_at_once = returns is not None and not reads(program.body, returns)
         self._value: Any = None
         self._do: dict[type[ast.AST], Callable[[Any], _Jump | None]] = {
             ast.Assign: self._assign,
@@ -464,14 +220,14 @@ class _Run:
         return None
 
     def _unpack(self, targets: Sequence[ast.expr], value: Any) -> _Jump | None:
-        items = vocabulary.iterate(self._guard, value)
+        items = values.iterate(self._guard, value)
         if len(items) != len(targets):
             raise Refusal("value", f"{len(items)} values for {len(targets)} names")
         jumps = [self._store(target, item) for target, item in zip(targets, items, strict=True)]
         return next((jump for jump in jumps if jump is not None), None)
 
     def _augment(self, node: ast.AugAssign) -> _Jump | None:
-        right, symbol = self._eval(node.value), _SYMBOLS[type(node.op)]
+        right, symbol = self._eval(node.value), SYMBOLS[type(node.op)]
         if isinstance(node.target, ast.Name):
             changed = self._arithmetic(symbol, self._name(node.target), right, in_place=True)
             return self._bind(node.target.id, changed)
@@ -485,7 +241,7 @@ class _Run:
         return self._block(node.body if self._true(node.test) else node.orelse)
 
     def _for(self, node: ast.For) -> _Jump | None:
-        for item in vocabulary.iterate(self._guard, self._eval(node.iter)):
+        for item in values.iterate(self._guard, self._eval(node.iter)):
             self._guard.budget.step()
             jump = self._store(node.target, item) or self._block(node.body)
             if jump is _Jump.BREAK:
@@ -513,13 +269,13 @@ class _Run:
         return self._located(self._evaluate, node)
 
     def _true(self, node: ast.expr) -> bool:
-        return vocabulary.truth(self._guard, self._eval(node))
+        return values.truth(self._guard, self._eval(node))
 
     def _name(self, node: ast.Name) -> Any:
         if node.id in self._variables:
             return self._variables[node.id]
-        if node.id in vocabulary.DTYPES:
-            return vocabulary.DTYPES[node.id]
+        if node.id in values.DTYPES:
+            return values.DTYPES[node.id]
         if node.id in self._functions or node.id in vocabulary.BUILTINS or node.id in _MODULE_NAMES:
             raise Refusal("functions", f"{node.id!r} is a function or module: it can be called, but is no value")
         raise self._unknown(node.id)
@@ -569,30 +325,30 @@ class _Run:
         return slice(*(None if end is None else self._eval(end) for end in (node.lower, node.upper, node.step)))
 
     def _binary(self, node: ast.BinOp) -> Any:
-        return self._arithmetic(_SYMBOLS[type(node.op)], self._eval(node.left), self._eval(node.right))
+        return self._arithmetic(SYMBOLS[type(node.op)], self._eval(node.left), self._eval(node.right))
 
     def _arithmetic(self, symbol: str, left: Any, right: Any, in_place: bool = False) -> Any:
-        made = vocabulary.arithmetic(self._guard, symbol, left, right, in_place)
+        made = operators.arithmetic(self._guard, symbol, left, right, in_place)
         return made if made is left else self._guard.take(made)
 
     def _unary(self, node: ast.UnaryOp) -> Any:
-        return self._guard.take(vocabulary.unary(self._guard, _SYMBOLS[type(node.op)], self._eval(node.operand)))
+        return self._guard.take(operators.unary(self._guard, SYMBOLS[type(node.op)], self._eval(node.operand)))
 
     def _boolean(self, node: ast.BoolOp) -> Any:
         ends_at = isinstance(node.op, ast.Or)
         for part in node.values[:-1]:
             value = self._eval(part)
-            if vocabulary.truth(self._guard, value) == ends_at:
+            if values.truth(self._guard, value) == ends_at:
                 return value
         return self._eval(node.values[-1])
 
     def _compare(self, node: ast.Compare) -> Any:
         left, result = self._eval(node.left), True
         for operator, side in zip(node.ops, node.comparators, strict=True):
-            if result is not True and not vocabulary.truth(self._guard, result):
+            if result is not True and not values.truth(self._guard, result):
                 return result
             right = self._eval(side)
-            result = self._guard.take(vocabulary.compare(self._guard, _SYMBOLS[type(operator)], left, right))
+            result = self._guard.take(operators.compare(self._guard, SYMBOLS[type(operator)], left, right))
             left = right
         return result
 
@@ -600,7 +356,7 @@ class _Run:
         return self._eval(node.body if self._true(node.test) else node.orelse)
 
     def _dict(self, node: ast.Dict) -> dict[Any, Any]:
-        keys = [vocabulary.hashable(self._guard, self._eval(key)) for key in node.keys if key is not None]
+        keys = [values.hashable(self._guard, self._eval(key)) for key in node.keys if key is not None]
         return self._guard.take(dict(zip(keys, [self._eval(value) for value in node.values], strict=True)))
 
     def _comprehension(self, node: ast.ListComp) -> list[Any]:
@@ -618,7 +374,7 @@ class _Run:
             made.append(self._eval(node.elt))
             return
         loop = node.generators[level]
-        for item in vocabulary.iterate(self._guard, self._eval(loop.iter)):
+        for item in values.iterate(self._guard, self._eval(loop.iter)):
             self._guard.budget.step()
             self._store(loop.target, item)
             if all(self._true(condition) for condition in loop.ifs):
@@ -633,7 +389,7 @@ class _Run:
         assert isinstance(part, ast.FormattedValue)
         spec = part.format_spec.values[0] if isinstance(part.format_spec, ast.JoinedStr) else None
         plain = str(spec.value) if isinstance(spec, ast.Constant) else ""
-        return vocabulary.text(self._guard, self._eval(part.value), plain)
+        return values.text(self._guard, self._eval(part.value), plain)
 
     # Calls
 
@@ -690,21 +446,11 @@ _MODULE_NAMES = frozenset({"np", "numpy"})
 def _numpy_value(dotted: str) -> float | DType | None:
     if dotted in vocabulary.CONSTANTS:
         return vocabulary.CONSTANTS[dotted]
-    if f"np.{dotted}" in vocabulary.DTYPES:
-        return vocabulary.DTYPES[f"np.{dotted}"]
+    if f"np.{dotted}" in values.DTYPES:
+        return values.DTYPES[f"np.{dotted}"]
     if dotted in vocabulary.NUMPY:
         raise Refusal("functions", f"np.{dotted} is a function: it can be called, but is no value")
     raise Refusal("names", f"np.{dotted} is not among the parts of NumPy that are allowed")
-
-
-def _reads(body: Iterable[ast.stmt], name: str) -> bool:
-    """Whether statements read a variable anywhere; changing it in place reads it."""
-    nodes = [node for statement in body for node in ast.walk(statement)]
-    names = [node.target if isinstance(node, ast.AugAssign) else node for node in nodes]
-    return any(
-        isinstance(found, ast.Name) and found.id == name and (isinstance(found.ctx, ast.Load) or found is not node)
-        for node, found in zip(nodes, names, strict=True)
-    )
 
 
 def _told(error: Exception) -> str:

@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 from vecenv.contract import BatchEnv, Control, ResetInfo
-from voxposer.agent import Agent, AgentConfig, Slot
+from voxposer.agent import Agent, AgentConfig
 from voxposer.language.llm import Llm, LlmConfig
 from voxposer.simpler_scene import hands
+from voxposer.slots import Slot
 
 
 class VoxPoserPolicy:
@@ -70,11 +71,11 @@ def report(agent: Agent, index: int) -> dict[str, Any]:
     calls = slot.lmps.trace
     paid = [call for call in calls if not call.cached]
     return {
-        "subtasks": slot.done_subtasks,
-        "passes": slot.passes,
-        "waypoints": slot.waypoints,
-        "missed_waypoints": slot.missed,
-        "empty_grasps": slot.empty_hands,
+        "subtasks": slot.progress.begun,
+        "passes": slot.progress.passes,
+        "waypoints": slot.counts.waypoints,
+        "missed_waypoints": slot.counts.missed,
+        "empty_grasps": slot.counts.empty_grasps,
         "llm_calls": len(calls),
         "llm_cached": sum(call.cached for call in calls),
         "llm_tokens": sum(call.prompt_tokens + call.completion_tokens for call in paid),
@@ -86,7 +87,7 @@ def report(agent: Agent, index: int) -> dict[str, Any]:
 def cause(slot: Slot) -> str:
     """Why a slot failed, in a few words that can be counted."""
     if not slot.cause:
-        return f"out of ticks at: {kind(slot.last)}"
+        return f"out of ticks at: {kind(slot.progress.text)}"
     return slot.cause.split(":")[0] if slot.cause.startswith("LmpError") else slot.cause
 
 

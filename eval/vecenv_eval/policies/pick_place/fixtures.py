@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vecenv.contract import RegionBox
-from vecenv.manipulation.world import HOME_ROTATION, World, down_facing, spun, yaw
+from vecenv.manipulation.world import HOME_ROTATION, SceneGeometry, down_facing, spun, yaw
 from vecenv_eval.policies.pick_place.motion import CLOSE, OPEN, Waypoint
 
 
@@ -46,7 +46,7 @@ class DrawerHandle:
     clear: float = 0.06
 
 
-def drawer_direction(world: World, region: RegionBox) -> np.ndarray:
+def drawer_direction(world: SceneGeometry, region: RegionBox) -> np.ndarray:
     """The direction in which a drawer opens: along its axis, to the side where the cabinet sticks out (its handles)."""
     if region.axis is None or region.parent is None:
         raise ValueError("a drawer's region has an axis and a parent")
@@ -63,7 +63,7 @@ def handle_of(region: RegionBox, direction: np.ndarray, handle: DrawerHandle) ->
     return region.pos + direction * (half + handle.before) - [0.0, 0.0, handle.below]
 
 
-def close_drawer(world: World, region: RegionBox, handle: DrawerHandle) -> list[Waypoint]:
+def close_drawer(world: SceneGeometry, region: RegionBox, handle: DrawerHandle) -> list[Waypoint]:
     """Push a drawer shut by its handle with closed, tilted fingers."""
     direction = drawer_direction(world, region)
     bar = handle_of(region, direction, handle)
@@ -81,7 +81,7 @@ def close_drawer(world: World, region: RegionBox, handle: DrawerHandle) -> list[
     ]
 
 
-def open_drawer(world: World, region: RegionBox, handle: DrawerHandle) -> list[Waypoint] | str:
+def open_drawer(world: SceneGeometry, region: RegionBox, handle: DrawerHandle) -> list[Waypoint] | str:
     """Pinch a drawer's handle bar from above and below with a tilted hand and pull; or return why not."""
     direction = drawer_direction(world, region)
     bar = handle_of(region, direction, handle)
@@ -131,7 +131,7 @@ def _nearest(options: list[np.ndarray], current: np.ndarray) -> np.ndarray:
     return max(options, key=lambda option: float(np.trace(option @ (HOME_ROTATION + 0.1 * current).T)))
 
 
-def turn_knob(world: World, fixture: str, angle: float) -> list[Waypoint]:
+def turn_knob(world: SceneGeometry, fixture: str, angle: float) -> list[Waypoint]:
     """Take hold of a knob's ridge from above and turn it by ``angle`` (radians, counterclockwise seen from above)."""
     points = world.points(fixture)
     ridge = points[points[:, 2] > points[:, 2].max() - 0.02]

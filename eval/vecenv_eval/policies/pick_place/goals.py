@@ -12,7 +12,7 @@ import numpy as np
 
 from vecenv.contract import ObjectsSnapshot, RegionBox
 from vecenv.manipulation.placing import Target
-from vecenv.manipulation.world import World
+from vecenv.manipulation.world import SceneGeometry
 
 Predicate = tuple[str, ...]
 
@@ -59,13 +59,13 @@ def extent(region: RegionBox) -> np.ndarray:
     return np.abs(region.mat @ region.half_extents)
 
 
-def shut(predicate: Predicate, world: World) -> bool:
+def shut(predicate: Predicate, world: SceneGeometry) -> bool:
     """Whether a placement goes into a drawer that must be opened first."""
     region = world.snapshot.regions.get(predicate[-1]) if predicate[0] == "in" else None
     return region is not None and region.axis is not None and _roofed(world, predicate[1], region, extent(region))
 
 
-def target_of(predicate: Predicate, world: World) -> Target | str:
+def target_of(predicate: Predicate, world: SceneGeometry) -> Target | str:
     """Where the origin of the object goes, or why that is beyond this policy."""
     snapshot, name = world.snapshot, predicate[1]
     if name not in snapshot.movable:
@@ -78,12 +78,12 @@ def target_of(predicate: Predicate, world: World) -> Target | str:
     return _on_region(world, predicate, region)
 
 
-def _on_object(world: World, support: str) -> Target:
+def _on_object(world: SceneGeometry, support: str) -> Target:
     xy = world.snapshot.poses[support][:2]
     return Target(xy[None], np.zeros(1), floor=world.ground(xy))
 
 
-def _in_region(world: World, predicate: Predicate, region: RegionBox) -> Target | str:
+def _in_region(world: SceneGeometry, predicate: Predicate, region: RegionBox) -> Target | str:
     half = extent(region)
     if _roofed(world, predicate[1], region, half):
         return "the place is under a roof, and this policy comes from above"
@@ -92,14 +92,14 @@ def _in_region(world: World, predicate: Predicate, region: RegionBox) -> Target 
     return Target(xy, cost, floor=floor, centre=region.pos[:2], half=half[:2])
 
 
-def _on_region(world: World, predicate: Predicate, region: RegionBox) -> Target:
+def _on_region(world: SceneGeometry, predicate: Predicate, region: RegionBox) -> Target:
     half = extent(region)
     xy, cost = _grid(region.pos[:2], np.maximum(half[:2] - 0.03, 0.0), _share(world, predicate))
     floor = region.pos[2] + half[2] if region.parent else world.ground(region.pos[:2])
     return Target(xy, cost, floor=floor)
 
 
-def _roofed(world: World, name: str, region: RegionBox, half: np.ndarray) -> bool:
+def _roofed(world: SceneGeometry, name: str, region: RegionBox, half: np.ndarray) -> bool:
     """Whether something spreads over a region."""
     points = world.others(name)
     offset = points[:, :2] - region.pos[:2]
@@ -109,7 +109,7 @@ def _roofed(world: World, name: str, region: RegionBox, half: np.ndarray) -> boo
     return bool((points[inner, 2] > region.pos[2] + half[2]).sum() > 1)
 
 
-def _share(world: World, predicate: Predicate) -> np.ndarray:
+def _share(world: SceneGeometry, predicate: Predicate) -> np.ndarray:
     """Where a thing should stand off the centre of a place that it shares with others of the goal, metres, [2]."""
     sharing = [p for p in world.snapshot.goal if p[0] in PLACING and p[2:] == predicate[2:]]
     points = world.points(predicate[1])[:, :2]

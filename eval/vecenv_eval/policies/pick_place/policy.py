@@ -15,7 +15,7 @@ import numpy as np
 
 from vecenv.contract import BatchEnv, ObjectsSnapshot, ResetInfo
 from vecenv.manipulation.placing import Grasped, choose_grasp
-from vecenv.manipulation.world import Margins, World
+from vecenv.manipulation.world import Margins, SceneGeometry
 from vecenv_eval.policies.pick_place import fixtures, goals, transfer
 from vecenv_eval.policies.pick_place.fixtures import DrawerHandle
 from vecenv_eval.policies.pick_place.goals import Predicate
@@ -140,7 +140,7 @@ class PickPlacePolicy:
             if snapshot is None:
                 slot.done = "no ground truth: the slot's physics failed"
             elif self._at_rest(slot, snapshot):
-                self._plan_slot(int(i), slot, World(snapshot, self.config.transfer, self._base[i]))
+                self._plan_slot(int(i), slot, SceneGeometry(snapshot, self.config.transfer, self._base[i]))
 
     def _at_rest(self, slot: _Slot, snapshot: ObjectsSnapshot) -> bool:
         """Whether things lie still; or the hand has hold of one of them, or this has been waited for long enough."""
@@ -148,7 +148,7 @@ class PickPlacePolicy:
         slot.waited = slot.waited + 1 if moved and not slot.held else 0
         return slot.waited == 0 or slot.waited > self.config.patience
 
-    def _plan_slot(self, i: int, slot: _Slot, world: World) -> None:
+    def _plan_slot(self, i: int, slot: _Slot, world: SceneGeometry) -> None:
         """Put the object down if it came along; else begin with the first goal predicate that does not hold."""
         if slot.held and self._came_along(slot, world):
             target = goals.target_of(slot.predicate, world)
@@ -161,12 +161,12 @@ class PickPlacePolicy:
             slot.held = ""
         self._begin(i, slot, world)
 
-    def _came_along(self, slot: _Slot, world: World) -> bool:
+    def _came_along(self, slot: _Slot, world: SceneGeometry) -> bool:
         assert slot.grasp is not None
         risen = world.snapshot.poses[slot.held][2] - slot.before[2]
         return risen > self.config.followed * (world.hand[2] - slot.grasp.pos[2])
 
-    def _begin(self, i: int, slot: _Slot, world: World) -> None:
+    def _begin(self, i: int, slot: _Slot, world: SceneGeometry) -> None:
         predicate = self._next(slot, world)
         if predicate is None or slot.attempts >= self.config.attempts:
             slot.done = f"gave up after {slot.attempts} attempts"
@@ -179,7 +179,7 @@ class PickPlacePolicy:
         else:
             self._begin_fixture(i, slot, world, predicate)
 
-    def _begin_fixture(self, i: int, slot: _Slot, world: World, predicate: Predicate) -> None:
+    def _begin_fixture(self, i: int, slot: _Slot, world: SceneGeometry, predicate: Predicate) -> None:
         region = world.snapshot.regions.get(predicate[1])
         if predicate[0] == "close" and region is not None and region.axis is not None:
             plan = fixtures.close_drawer(world, region, self.config.handle)
@@ -196,7 +196,7 @@ class PickPlacePolicy:
         slot.tried.add(predicate)
         self._follower.load(i, plan)
 
-    def _begin_transfer(self, i: int, slot: _Slot, world: World, predicate: Predicate) -> None:
+    def _begin_transfer(self, i: int, slot: _Slot, world: SceneGeometry, predicate: Predicate) -> None:
         name = predicate[1]
         target = goals.target_of(predicate, world)
         if isinstance(target, str):
@@ -210,7 +210,7 @@ class PickPlacePolicy:
         slot.held, slot.predicate, slot.grasp = name, predicate, grasp
         slot.before = world.snapshot.poses[name].copy()
 
-    def _next(self, slot: _Slot, world: World) -> Predicate | None:
+    def _next(self, slot: _Slot, world: SceneGeometry) -> Predicate | None:
         """The first predicate that neither holds nor was worked on; when none is left, all of them count again."""
         ordered = goals.in_order(world.snapshot.goal)
         missing = [p for p in ordered if p not in slot.tried and not goals.holds(p, world.snapshot)]

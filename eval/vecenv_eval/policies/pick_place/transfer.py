@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from vecenv.manipulation.placing import Grasped, Target, carry_height, put_down
-from vecenv.manipulation.world import World, upright
+from vecenv.manipulation.world import SceneGeometry, upright
 from vecenv_eval.policies.pick_place.motion import CLOSE, HOLD, OPEN, Waypoint
 
 
-def pick(world: World, name: str, grasp: Grasped, towards: np.ndarray) -> list[Waypoint]:
+def pick(world: SceneGeometry, name: str, grasp: Grasped, towards: np.ndarray) -> list[Waypoint]:
     """Waypoints that take hold of an object and lift it for a transfer.
 
     Args:
@@ -40,7 +40,7 @@ def pick(world: World, name: str, grasp: Grasped, towards: np.ndarray) -> list[W
     ]
 
 
-def place(world: World, name: str, target: Target) -> list[Waypoint]:
+def place(world: SceneGeometry, name: str, target: Target) -> list[Waypoint]:
     """Waypoints that put down an object that is in the hand.
 
     Args:
@@ -60,7 +60,7 @@ def place(world: World, name: str, target: Target) -> list[Waypoint]:
     ]
 
 
-def _rise(world: World, height: float, grip: float) -> list[Waypoint]:
+def _rise(world: SceneGeometry, height: float, grip: float) -> list[Waypoint]:
     """Straight up first, where the hand is well below the height at which it will travel."""
     if world.hand[2] > height - 0.04:
         return []

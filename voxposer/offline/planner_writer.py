@@ -1,7 +1,7 @@
-"""The offline writer as planner: from an instruction and the names in the scene to sentences for the composer.
+"""Programs of the planner: an instruction becomes sentences for the composer.
 
-In come an instruction and entity names; out comes the planner's program, one ``composer("...")`` call a subtask. A
-phrase that fits one name becomes that name; a phrase that fits several stays a phrase, and parse_query_obj settles it
+An instruction and entity names come in; the planner's program goes out, one ``composer("...")`` call per subtask. A
+phrase that fits one name becomes that name; a phrase that fits several stays a phrase, and parse_query_obj resolves it
 by comparing positions when the subtask runs.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from voxposer.offline.grammar import Action, Noun, Place, Relation, read_instruction, read_noun, side_said
-from voxposer.offline.words import Name, NotUnderstood, matching, read_names
+from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 
 # Distances spoken of in subtasks, centimetres: over a target before the last descent; before a target that is entered
 # from a side; after grasping and releasing; the way of a drawer, which stops at its end by itself; a step of a door;
@@ -37,12 +37,12 @@ class Found:
 
     @property
     def is_settled(self) -> bool:
-        """Whether it is one thing, whatever the positions."""
+        """Whether it is one object, independent of positions."""
         return len(self.names) == 1 or self.noun.indefinite
 
     @property
     def text(self) -> str:
-        """How a subtask speaks of it: by name if it can."""
+        """Words for it in a subtask: its name if it is settled."""
         return f"the {self.names[0].text}" if self.is_settled else str(self.noun)
 
 

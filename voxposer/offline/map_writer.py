@@ -1,7 +1,7 @@
-"""The offline writer of the five kinds of map: affordance, avoidance, rotation, velocity and gripper.
+"""Programs that make the five kinds of map: affordance, avoidance, rotation, velocity and gripper.
 
-In comes a query such as "a point 10cm above the place position of the plate_1"; out comes the program that makes the
-map, in the vocabulary that the prompts teach. Positions are voxels: x back to front, y left to right, z up.
+A query such as "a point 10cm above the place position of the plate_1" comes in; the program that makes the map goes
+out, with the functions that the prompts show. Positions are voxels: x back to front, y left to right, z up.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 
 from voxposer.offline.rules import BESIDE, CM, SIDES, THING, Groups, Rules, Writer, choose, get, variable
 
-# Room left between things put next to each other, centimetres.
+# Distance between objects that are put next to each other, centimetres.
 ROOM = 2
 
 # Points: what affordance queries ask for, and gripper queries too
@@ -40,7 +40,7 @@ def _above_point(match: Groups) -> list[str]:
 
 
 def _before_place(match: Groups) -> list[str]:
-    """In front of a place that is entered through an opening."""
+    """A point in front of a place that has an opening."""
     name = variable(match["thing"])
     return [
         get(match["thing"]),
@@ -50,7 +50,7 @@ def _before_place(match: Groups) -> list[str]:
 
 
 def _along(match: Groups) -> list[str]:
-    """Some way from a thing along or against a direction of a part."""
+    """A point at a distance from an object, along or against a direction of a part."""
     name, sign = variable(match["thing"]), "-" if match["way"] == "against" else ""
     field = "normal" if match["field"] == "normal" else "axis"
     start = name if match["start"] == match["thing"] else "start"

@@ -1,8 +1,8 @@
-"""The offline writer as parse_query_obj: a phrase for a thing becomes a program that detects it.
+"""Programs of parse_query_obj: a phrase for an object becomes a program that detects it.
 
-In come a phrase and the entity names of the scene; out comes the program. What words alone settle is looked up by name;
-what they leave open ("the black bowl between the plate and the ramekin") is settled by comparing positions, in code
-that is written here and run later: the writer itself never sees a position.
+A phrase and the entity names of the scene come in; the program goes out. An object that the words determine is looked
+up by name; otherwise ("the black bowl between the plate and the ramekin") the program compares positions at run time.
+The writer itself never sees a position.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import re
 from collections.abc import Sequence
 
 from voxposer.offline.grammar import Noun, Relation, read_noun
-from voxposer.offline.planner import Found, ground, holder
+from voxposer.offline.names import Name, NotUnderstood, read_names
+from voxposer.offline.planner_writer import Found, ground, holder
 from voxposer.offline.rules import variable
-from voxposer.offline.words import Name, NotUnderstood, read_names
 
 _HANDS = frozenset(["gripper", "hand", "ee", "end effector", "end_effector", "endeffector"])
 _TABLES = frozenset(["table", "workspace", "work space", "desk", "floor"])
@@ -29,7 +29,7 @@ _SIDES = {
 }
 _CONTAINERS = frozenset(["drawer", "compartment", "inside", "basket", "tray", "microwave", "caddy"])
 _BESIDE = {"left_of": ("<", 1), "right_of": (">", 1), "back_of": ("<", 0), "front_of": (">", 0)}
-# Relations that say nothing of heights: they hold for what has been lifted, too.
+# Relations that do not depend on height: they also hold for a lifted object.
 _FLAT = frozenset(["near", "between", "center", "outside"])
 # Voxels are not cubes: centimetres of one along each axis.
 _SCALE = "cm = np.array([index2cm(1, 'x'), index2cm(1, 'y'), index2cm(1, 'z')])"
@@ -52,7 +52,7 @@ def write_query(query: str, objects: Sequence[str]) -> str:
 
 
 class _Locator:
-    """Writes the lines that find a noun, and those for the things it is described by."""
+    """Writes the lines that find a noun and the objects that describe it."""
 
     def __init__(self, names: Sequence[Name]) -> None:
         self._names = names

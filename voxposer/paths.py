@@ -1,8 +1,8 @@
 """Requests of a batch become paths over voxels, in one call of the planner for all that have the same shape.
 
-In: what the programs of several slots asked for (``voxposer.interface``). Out: a path a request. In between stands what
-upstream's ``execute`` does before it plans: the scene counts as an obstacle except near the start and the targets, what
-the hand holds does not, and a map that was not given has no say.
+In: the motions that programs of several slots asked for (``voxposer.requests``). Out: a path for each. As in upstream's
+``execute``, the scene is an obstacle except near the start and the targets, the held object is none, and a map that was
+not given has no effect.
 """
 
 from __future__ import annotations
@@ -11,20 +11,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vecenv.manipulation.routes import RouteConfig, works
-from voxposer.interface import Interface, InterfaceError, Request
-from voxposer.perception import Perception
+from vecenv.manipulation.routes import RouteConfig, is_contact_move
+from voxposer.interface import Interface
+from voxposer.perception.view import Perception
 from voxposer.planning import maps
-from voxposer.planning.planner import Fault, PlannerConfig, optimize_paths
+from voxposer.planning.config import Fault, PlannerConfig
+from voxposer.planning.planner import optimize_paths
+from voxposer.requests import InterfaceError, MotionRequest
 
 # Paths planned at once: few shapes to compile for, and a bound on memory (a float64 volume of a path is 8 MB).
 CHUNK = 8
 
 
 def plan_paths(
-    wants: Sequence[tuple[Interface, Request]], config: PlannerConfig, route: RouteConfig
+    wants: Sequence[tuple[Interface, MotionRequest]], config: PlannerConfig, route: RouteConfig
 ) -> list[np.ndarray | InterfaceError]:
-    """A path [P, 3] in voxels for each request: empty for one that asks for none, an error for one that has none."""
+    """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path."""
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
     asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None]
     for first in range(0, len(asking), CHUNK):
@@ -35,7 +37,7 @@ def plan_paths(
 
 
 def _planned(
-    wants: Sequence[tuple[Interface, Request]], config: PlannerConfig, route: RouteConfig
+    wants: Sequence[tuple[Interface, MotionRequest]], config: PlannerConfig, route: RouteConfig
 ) -> list[np.ndarray | InterfaceError]:
     padded = [*wants, *[wants[-1]] * ((1 if len(wants) == 1 else CHUNK) - len(wants))]
     starts = np.stack([start_of(interface, request) for interface, request in padded])
@@ -57,13 +59,13 @@ def _planned(
     ]
 
 
-def start_of(interface: Interface, request: Request) -> np.ndarray:
-    """Voxel to plan from: of the thing to be pushed, or of the hand at the end of what was planned before."""
+def start_of(interface: Interface, request: MotionRequest) -> np.ndarray:
+    """Voxel to plan from: of the object to be pushed, or of the hand at the end of what was planned before."""
     return request.start if request.object_centric else interface.perception.grid.voxel(interface.perception.ee.pos)
 
 
-def touches(perception: Perception, request: Request, config: RouteConfig) -> bool:
-    """Whether a motion is to push or pull, as `works` says: then only the program's own map is in its way."""
+def is_contact_motion(perception: Perception, request: MotionRequest, config: RouteConfig) -> bool:
+    """Whether the hand is meant to push or pull: then only the program's own avoidance map is an obstacle."""
     if request.targets is None or request.object_centric:
         return False
     here = perception.grid.voxel(perception.ee.pos)
@@ -71,12 +73,12 @@ def touches(perception: Perception, request: Request, config: RouteConfig) -> bo
     goal = perception.position_of(ends[int(np.linalg.norm(ends - here, axis=1).argmin())])
     hold = {"held": perception.held, "attached": perception.attached}
     closed = perception.closed and request.closed_at(here)
-    return works(perception.ee.pos, goal, closed=closed, config=config, **hold)
+    return is_contact_move(perception.ee.pos, goal, closed=closed, config=config, **hold)
 
 
-def obstacle_map(perception: Perception, request: Request, route: RouteConfig) -> np.ndarray:
-    """What the planner keeps away from, float64 [N, N, N] in 0..1."""
-    if touches(perception, request, route):
+def obstacle_map(perception: Perception, request: MotionRequest, route: RouteConfig) -> np.ndarray:
+    """The obstacle map of the planner, float64 [N, N, N] in 0..1."""
+    if is_contact_motion(perception, request, route):
         return np.zeros((perception.grid.size,) * 3) if request.avoidance is None else request.avoidance.astype(float)
     size = perception.grid.size
     avoidance = np.zeros((size,) * 3) if request.avoidance is None else request.avoidance.astype(float)
@@ -86,13 +88,13 @@ def obstacle_map(perception: Perception, request: Request, route: RouteConfig) -
         if request.occupancy is not None
         else {"start": perception.grid.voxel(perception.ee.pos)}
     )
-    return np.asarray(maps.preprocess_avoidance(avoidance, occupied, request.targets, **near))
+    return np.asarray(maps.preprocess_avoidance(avoidance, occupied, np.asarray(request.targets), **near))
 
 
 def scene_occupancy(perception: Perception, moving: str) -> np.ndarray:
-    """Voxels that something other than the robot and ``moving`` occupies, bool [N, N, N]."""
+    """Voxels occupied by anything but the robot and ``moving``, bool [N, N, N]."""
     parts = [part.cloud.points for part in perception.snapshot.parts.values() if part.parent != moving]
-    points = np.concatenate([perception.world.others(moving), *parts])
+    points = np.concatenate([perception.scene.others(moving), *parts])
     grid = perception.grid
     inside = ((points >= grid.lo) & (points <= grid.hi)).all(axis=1)
     return grid.occupancy(points[inside])

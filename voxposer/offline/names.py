@@ -1,8 +1,8 @@
-"""Words of the offline writer: which entity names a noun phrase can mean.
+"""Which entity names a noun phrase can mean.
 
-In comes a list of entity names, as the ``objects = [...]`` line of a prompt gives them (``akita_black_bowl_1``,
-``wooden_cabinet_1_top_handle``), and the words of a phrase ("the black bowl"); out come the names that fit. Nothing
-here knows a task or a position: a phrase that fits several names stays ambiguous and is settled by generated code.
+A list of entity names, as the ``objects = [...]`` line of a prompt gives them (``akita_black_bowl_1``,
+``wooden_cabinet_1_top_handle``), and the words of a phrase ("the black bowl") come in; the names that fit go out. No
+task and no position is known here: a phrase that fits several names stays ambiguous and is resolved by generated code.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ def _words(text: str) -> frozenset[str]:
 
 
 COLOURS = _words("black white red green blue yellow orange brown purple pink grey silver golden cyan")
-# Words that order several alike things in space; they also occur inside part names (top_drawer, back_compartment).
+# Words that tell several equal objects apart by position; they also occur in part names (top_drawer, back_compartment).
 SIDES = _words("left right front back middle top bottom upper lower")
-# Words for parts of a thing. A part is only meant by a phrase that speaks of parts.
+# Words for parts of an object. Only a phrase with such a word can mean a part.
 PART_WORDS = _words("handle drawer knob button burner compartment section slot level inside door")
-# Words that say how a thing is packed or made rather than what it is: they may be missing from the name.
+# Words for packaging and make; they may be missing from the name.
 _PACKAGES = _words("box can bottle carton pack package packet container jar tin bar")
 _MAKES = _words("wine wooden wood flat desk coffee akita porcelain glazed rim kitchen small big bigger new")
-# What a speaker may call a thing whose name has the word on the left.
+# Word in a name -> other words that an instruction may use for it.
 _SENSES = {
     "porcelain": ("white",),
     "cookie": ("box", "biscuit"),
@@ -55,18 +55,18 @@ _NOT_PLURAL = _words("gas glass less plus lens alias")
 
 
 class NotUnderstood(InvalidInput):
-    """The offline writer has no program for a query; the message says which words it stopped at."""
+    """The offline writer has no program for a query; the message quotes the words that it does not understand."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Name:
-    """An entity name taken apart.
+    """An entity name split into words.
 
     Attributes:
         text: the name itself, ``"wooden_cabinet_1_top_handle"``.
-        whole: name of the thing it is a part of; the name itself when it is no part.
+        whole: name of the object it is a part of; the name itself for a whole object.
         words: its words without instance numbers, singular.
-        part_words: the words that name the part, empty for a whole thing.
+        part_words: the words that name the part, empty for a whole object.
     """
 
     text: str
@@ -81,17 +81,17 @@ class Name:
 
     @property
     def kind(self) -> tuple[str, ...]:
-        """What instances of one category share."""
+        """Words that instances of one category share."""
         return self.words
 
     @property
     def senses(self) -> frozenset[str]:
-        """All words by which a speaker may mean it."""
+        """All words that an instruction may use for it."""
         return frozenset(self.words).union(*(_SENSES.get(word, ()) for word in self.words))
 
     @property
     def colours(self) -> frozenset[str]:
-        """Colours it has by name."""
+        """Colours in its name."""
         return self.senses & COLOURS
 
 
@@ -125,7 +125,7 @@ def matching(words: Iterable[str], names: Sequence[Name]) -> tuple[Name, ...]:
     """The names that a phrase with these content words can mean.
 
     A name itself means that name. A phrase with a part word ("drawer", "knob") means a part if one fits, any other
-    phrase means whole things. All words must fit. Where no name fits, words for packages and makes are let go ("the
+    phrase means whole objects. All words must fit. Where no name fits, words for packaging and make are ignored ("the
     cream cheese box", "the wine bottle" for a ``white_bottle_1``), never colours nor the noun itself. Of the names that
     fit, those with the fewest colours that were not said are kept: "the white mug" is not ``white_yellow_mug_1`` beside
     ``porcelain_mug_1``.

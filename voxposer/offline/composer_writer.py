@@ -1,7 +1,7 @@
-"""The offline writer as composer: one subtask becomes maps asked for in words, and motions that execute them.
+"""Programs of the composer: calls that ask for maps in words, and the motions that execute them.
 
-In comes a sentence such as "place it on the plate_1"; out comes its program. The composer sees no entity names: phrases
-for things are passed on to the map writers and parse_query_obj as they are.
+A sentence such as "place it on the plate_1" comes in; its program goes out. The composer sees no entity names: phrases
+for objects are passed on unchanged to the map writers and parse_query_obj.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from voxposer.offline.rules import BESIDE, CM, SIDES, THING, Groups, Rules, choo
 
 # Room left before and after a push, centimetres; a pushed thing is let go of while it slides.
 PUSH_ROOM, PUSH_RUN = 5, 8
-# Degrees that a knob is turned: enough to switch on; all the way back, its stop ends it.
+# Degrees that a knob is turned to switch on, and to switch off, where its stop ends the motion.
 SWITCH_ON, SWITCH_OFF = 90, -120
 
 _DIRECTIONS = {

@@ -1,17 +1,17 @@
 """``offline/libero``: a litellm provider that writes LMP programs by rule, with no network and no key.
 
-In comes a chat request as a language model gets it: prompt, the scene's ``objects = [...]`` line and a query. Out comes
-a program for that query, or an error that says what was not understood; never a guess. The words of all LIBERO and
-LIBERO-PRO tasks and of the SIMPLER tasks are covered. It is a grammar, not a model: results made with it say so.
+A chat request as a language model gets it comes in: prompt, the scene's ``objects = [...]`` line and a query. A program
+for that query goes out, or an error that says what was not understood. The language of all LIBERO, LIBERO-PRO and
+SIMPLER tasks is covered. It is a grammar, not a model, and results made with it say so.
 
     import litellm
-    from voxposer import offline
+    from voxposer.offline.provider import register
 
-    offline.register()
+    register()
     litellm.completion(model="offline/libero", messages=[...])
 
-The writer sees nothing but the messages. Which LMP it writes for it reads off the prompt, as it reads the names of
-things off the ``objects`` line; where things are it never learns, the programs compare positions when they run.
+The writer sees only the messages: it reads the LMP off the prompt and the names of objects off the ``objects`` line. It
+never sees positions; the programs compare positions when they run.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from voxposer.offline import maps as maps
-from voxposer.offline.composer import write_composer
-from voxposer.offline.planner import write_planner
-from voxposer.offline.query import write_query
-from voxposer.offline.words import NotUnderstood
+from voxposer.offline import map_writer
+from voxposer.offline.composer_writer import write_composer
+from voxposer.offline.names import NotUnderstood
+from voxposer.offline.planner_writer import write_planner
+from voxposer.offline.query_writer import write_query
 
 PROVIDER, MODEL = "offline", "offline/libero"
 _QUERY = re.compile(r"^# Query: (.*)$", re.MULTILINE)
 _OBJECTS = re.compile(r"^objects ?= ?(\[.*\])$", re.MULTILINE)
 _NAMED = re.compile(r"Queries are for `(\w+)`")
-# A token as word pieces go: letters four at a time, digits three at a time, each other sign, with the space before it.
+# A token, roughly as in word-piece vocabularies: up to four letters or three digits with the space before, or one sign.
 _TOKEN = re.compile(r" ?[^\W\d_]{1,4}| ?\d{1,3}|\s|[^\s\w]|_")
 
 Writer = Callable[[str, Sequence[str]], str]
@@ -40,11 +40,11 @@ _WRITERS: Mapping[str, Writer] = {
     "planner": write_planner,
     "composer": lambda query, _: write_composer(query),
     "parse_query_obj": write_query,
-    "get_affordance_map": lambda query, _: maps.write_affordance(query),
-    "get_avoidance_map": lambda query, _: maps.write_avoidance(query),
-    "get_rotation_map": lambda query, _: maps.write_rotation(query),
-    "get_velocity_map": lambda query, _: maps.write_velocity(query),
-    "get_gripper_map": lambda query, _: maps.write_gripper(query),
+    "get_affordance_map": lambda query, _: map_writer.write_affordance(query),
+    "get_avoidance_map": lambda query, _: map_writer.write_avoidance(query),
+    "get_rotation_map": lambda query, _: map_writer.write_rotation(query),
+    "get_velocity_map": lambda query, _: map_writer.write_velocity(query),
+    "get_gripper_map": lambda query, _: map_writer.write_gripper(query),
 }
 # What only the examples of one LMP's prompt call, in the order in which to look for it.
 _SIGNATURES = (
@@ -130,7 +130,7 @@ def _objects(text: str) -> list[str]:
 
 
 def _handler() -> Any:
-    """The provider, as litellm wants it."""
+    """The provider as an object of litellm's class."""
     import litellm
     from litellm.llms.custom_llm import CustomLLM, CustomLLMError
 

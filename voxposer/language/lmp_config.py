@@ -1,0 +1,113 @@
+"""What a language program is: its name, its options, the functions it may call, its errors and its trace.
+
+Plain tables and records; ``voxposer.language.lmp`` runs the programs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from voxposer.sandbox.guard import HostFault
+
+MAPS = ("get_affordance_map", "get_avoidance_map", "get_rotation_map", "get_velocity_map", "get_gripper_map")
+NAMES = ("planner", "composer", "parse_query_obj", *MAPS)
+
+
+class LmpError(HostFault):
+    """A language program that could not be run, or not on.
+
+    Attributes:
+        lmp: which one.
+        query: what it was asked.
+        rule: the rule of the sandbox that was broken; ``reply`` if the model gave no program, ``query`` for a query
+            that cannot be asked, ``result`` for a value of the wrong kind.
+        reason: what happened.
+        line: line of the program, None if there is none.
+    """
+
+    def __init__(self, lmp: str, query: str, rule: str, reason: str, line: int | None = None) -> None:
+        where = "" if line is None else f"line {line}: "
+        super().__init__(f"{lmp}({query!r}): {where}{reason} [rule: {rule}]")
+        self.lmp, self.query, self.rule, self.reason, self.line = lmp, query, rule, reason, line
+
+
+@dataclass(frozen=True, kw_only=True)
+class LmpConfig:
+    """One language program; upstream's keys.
+
+    Attributes:
+        name: the function programs call it by.
+        stop: tokens its answer ends at.
+        max_tokens: length of its answer at most.
+        temperature: of the model.
+        query_prefix: put before a query.
+        query_suffix: put after it.
+        maintain_session: whether earlier queries and answers are shown again, and their variables kept.
+        include_context: whether the model sees, and the program has, the list ``objects``.
+        has_return: whether the program returns a value.
+        return_val_name: the variable that is returned.
+    """
+
+    name: str
+    stop: tuple[str, ...] = ("# Query: ", "objects =")
+    max_tokens: int = 512
+    temperature: float = 0.0
+    query_prefix: str = "# Query: "
+    query_suffix: str = "."
+    maintain_session: bool = False
+    include_context: bool = False
+    has_return: bool = True
+    return_val_name: str = "ret_val"
+
+
+CONFIGS: Mapping[str, LmpConfig] = MappingProxyType(
+    {
+        "planner": LmpConfig(name="planner", stop=("# Query: ", "objects = "), include_context=True, has_return=False),
+        "composer": LmpConfig(name="composer", has_return=False),
+        "parse_query_obj": LmpConfig(name="parse_query_obj", include_context=True),
+        **{name: LmpConfig(name=name) for name in MAPS},
+    }
+)
+
+# Functions that act, and the only LMPs whose programs may call them: maps and references are evaluated whenever
+# someone looks, so nothing may happen when they are.
+ACTIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "planner": ("composer",),
+        "composer": ("execute", "reset_to_default_pose", "parse_query_obj", *MAPS),
+        "parse_query_obj": (),
+        **dict.fromkeys(MAPS, ("parse_query_obj",)),
+    }
+)
+RESTRICTED = frozenset(name for names in ACTIONS.values() for name in names)
+
+
+@dataclass(kw_only=True)
+class Call:
+    """One question to the model, for people to read.
+
+    Attributes:
+        lmp: which language program.
+        query: what it was asked.
+        context: the context line, empty without.
+        model: the model asked.
+        code: its answer without fences; empty if there was none.
+        cached: whether the answer was kept from earlier.
+        prompt_tokens: tokens of the question, as counted when it was asked.
+        completion_tokens: tokens of the answer, likewise.
+        cost_usd: its price, None if unknown.
+        error: what went wrong with the answer or its program, None if nothing did.
+    """
+
+    lmp: str
+    query: str
+    context: str
+    model: str
+    code: str = ""
+    cached: bool = False
+    prompt_tokens: int = 0
+    completion_tokens: int = 0
+    cost_usd: float | None = None
+    error: str | None = None

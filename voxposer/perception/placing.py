@@ -1,0 +1,74 @@
+"""Where the hand lets go of what it holds, on or in an object or part.
+
+In: the geometry of one snapshot and the options of perception. Out: a
+:class:`~vecenv.manipulation.placing.Target` for a name, and the pose of the hand over or in it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vecenv.contract import Part
+from vecenv.manipulation.placing import Target, put_down
+from vecenv.manipulation.world import SceneGeometry, upright
+from voxposer.perception.config import PerceptionConfig
+from voxposer.perception.grasping import HandPose
+from voxposer.perception.parts import cavity, exit_direction, world_half_extents
+
+
+class PlaceFinder:
+    """Places in one snapshot.
+
+    Args:
+        scene: geometry of the snapshot.
+        config: options of perception.
+    """
+
+    def __init__(self, scene: SceneGeometry, config: PerceptionConfig) -> None:
+        self.scene, self.config = scene, config
+
+    def pose(self, points: np.ndarray, target: Target | None, held: str) -> HandPose:
+        """Pose of the hand that puts the held object on a target; above the points [N, 3] when nothing is held."""
+        rotation = upright(self.scene.hand_rotation)
+        if target is None or not held:
+            top = np.append((points.min(axis=0) + points.max(axis=0))[:2] / 2, points[:, 2].max() + self.config.above)
+            return HandPose(top, rotation)
+        return HandPose(*put_down(self.scene, held, target))
+
+    def of_object(self, name: str) -> Target | None:
+        """Target for a whole object: its only space, else its only top, else the object itself."""
+        snapshot = self.scene.snapshot
+        parts = [spec for spec in snapshot.parts.values() if spec.parent == name]
+        for kind in ("space", "top"):
+            places = [part for part in parts if part.kind == kind]
+            if len(places) == 1:
+                return self.of_part(places[0])
+        xy = snapshot.poses[name][:2]
+        return Target(xy[None], np.zeros(1), floor=self.scene.ground(xy))
+
+    def of_part(self, part: Part) -> Target | None:
+        """Target for a part; None for a part that carries nothing."""
+        if part.box is None or part.kind == "handle":
+            return None
+        half = world_half_extents(part.box)
+        xy, cost = grid_around(part.box.pos[:2], np.maximum(half[:2] - self.config.edge, 0.0))
+        if part.kind == "top":
+            return Target(xy, cost, floor=part.box.pos[2] + half[2])
+        out = exit_direction(part, self.scene) if part.kind == "space" else np.array([0.0, 0.0, 1.0])
+        if out[2] > 0.5:
+            floor = max(part.box.pos[2] - half[2], self.scene.ground(part.box.pos[:2]))
+            return Target(xy, cost, floor=floor, centre=part.box.pos[:2], half=half[:2])
+        low, high = cavity(part, self.scene)
+        middle = (low + high)[:2] / 2
+        return Target(
+            middle[None], np.zeros(1), low[2], centre=middle, half=(high - low)[:2] / 2, entry=out, roof=high[2]
+        )
+
+
+def grid_around(centre: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions around a centre [M, 2], the centre first, and their cost [M]: the distance in units of 2 cm."""
+    ticks = np.linspace(-1, 1, 5)
+    offsets = np.stack(np.meshgrid(ticks * reach[0], ticks * reach[1]), axis=-1).reshape(-1, 2)
+    far = np.linalg.norm(offsets, axis=1)
+    order = np.argsort(far, kind="stable")
+    return centre + offsets[order], far[order] / 0.02

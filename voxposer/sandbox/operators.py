@@ -1,0 +1,174 @@
+"""Operators of the small language: arithmetic, comparisons and signs, with the size of results checked beforehand.
+
+In: a ``Guard``, the operator's symbol and values that the guard has accepted. Out: a plain result, which the
+interpreter hands to the guard.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from voxposer.sandbox.guard import Guard, Refusal, kind_of, refuse_kind
+from voxposer.sandbox.values import APPENDED_BYTES, broadcast, numbers, require_power, truth
+
+# Multiplications of a matrix product that a program may ask for.
+_MULTIPLICATIONS = 10**8
+
+
+def arithmetic(guard: Guard, symbol: str, left: Any, right: Any, in_place: bool = False) -> Any:
+    """``left symbol right``; in place it changes arrays and lists as Python does.
+
+    Raises:
+        Refusal: the result would be too large, or the operator does not fit the values.
+    """
+    if (_numeric(left) and _numeric(right)) or _mixed(left, right):
+        return _numeric_operation(guard, symbol, left, right, in_place)
+    if symbol == "+" and _same_sequence(left, right):
+        _require_length(guard, left, len(left) + len(right))
+        guard.hold(len(right) * APPENDED_BYTES)
+        return (operator.iadd if in_place else operator.add)(left, right)
+    if symbol == "*":
+        return _repeated(guard, left, right)
+    raise Refusal("types", f"{kind_of(left)} {symbol} {kind_of(right)}")
+
+
+def _numeric(value: Any) -> bool:
+    return kind_of(value) in ("number", "array")
+
+
+def _mixed(left: Any, right: Any) -> bool:
+    """Whether one is an array and the other a list that NumPy would make one."""
+    kinds = {kind_of(left), kind_of(right)}
+    return "array" in kinds and bool(kinds & {"list", "tuple"})
+
+
+def _same_sequence(left: Any, right: Any) -> bool:
+    return type(left) is type(right) and isinstance(left, (str, list, tuple))
+
+
+def _require_length(guard: Guard, like: Any, length: int) -> None:
+    if isinstance(like, str):
+        guard.characters(length)
+    else:
+        guard.length(length)
+
+
+def _repeated(guard: Guard, left: Any, right: Any) -> Any:
+    sequence, times = (left, right) if isinstance(left, (str, list, tuple)) else (right, left)
+    if not isinstance(sequence, (str, list, tuple)) or not isinstance(times, (int, np.integer)):
+        raise Refusal("types", f"{kind_of(left)} * {kind_of(right)}")
+    _require_length(guard, sequence, len(sequence) * max(int(times), 0))
+    return sequence * int(times)
+
+
+def _numeric_operation(guard: Guard, symbol: str, left: Any, right: Any, in_place: bool) -> Any:
+    left, right = numbers(guard, left), numbers(guard, right)
+    if symbol == "@":
+        return dot(guard, left, right)
+    if symbol == "**":
+        require_power(guard, left, right)
+    broadcast(guard, left, right)
+    table = _IN_PLACE if in_place and isinstance(left, np.ndarray) else _OPERATORS
+    return table[symbol](left, right)
+
+
+_OPERATORS: dict[str, Callable[..., Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "//": operator.floordiv,
+    "%": operator.mod,
+    "**": operator.pow,
+    "&": operator.and_,
+    "|": operator.or_,
+    "^": operator.xor,
+}
+_IN_PLACE: dict[str, Callable[..., Any]] = {
+    "+": operator.iadd,
+    "-": operator.isub,
+    "*": operator.imul,
+    "/": operator.itruediv,
+    "//": operator.ifloordiv,
+    "%": operator.imod,
+    "**": operator.ipow,
+    "&": operator.iand,
+    "|": operator.ior,
+    "^": operator.ixor,
+}
+_COMPARISONS: dict[str, Callable[..., Any]] = {
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "is": operator.is_,
+    "is not": operator.is_not,
+}
+
+
+def compare(guard: Guard, symbol: str, left: Any, right: Any) -> Any:
+    """``left symbol right``: element by element for arrays."""
+    guard.weigh(left)
+    guard.weigh(right)
+    if symbol in ("in", "not in"):
+        return _contains(guard, right, left) == (symbol == "in")
+    if symbol in ("is", "is not"):
+        return _COMPARISONS[symbol](left, right)
+    if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
+        if left is None or right is None:
+            return symbol == "!="
+        left, right = numbers(guard, left), numbers(guard, right)
+        broadcast(guard, left, right)
+    return _COMPARISONS[symbol](left, right)
+
+
+def _contains(guard: Guard, container: Any, item: Any) -> bool:
+    if isinstance(container, str) and isinstance(item, str):
+        return item in container
+    if isinstance(container, range):  # which walks through all of it for anything but an int
+        return _is_whole(item) and int(item) in container
+    if isinstance(container, (list, tuple, dict)):
+        return item in container
+    refuse_kind(container, "a list, a dictionary or text")
+
+
+def _is_whole(value: Any) -> bool:
+    return kind_of(value) == "number" and math.isfinite(value) and value == int(value)
+
+
+def unary(guard: Guard, symbol: str, value: Any) -> Any:
+    """``-value``, ``+value``, ``~value`` or ``not value``."""
+    if symbol == "not":
+        return not truth(guard, value)
+    value = numbers(guard, value) if _numeric(value) else refuse_kind(value, "numbers")
+    broadcast(guard, value)
+    if symbol == "~":
+        return np.invert(value) if isinstance(value, (np.ndarray, np.generic)) else _inverted(value)
+    return -value if symbol == "-" else +value
+
+
+def _inverted(value: Any) -> int:
+    if isinstance(value, bool):
+        raise Refusal("types", "~ of a truth value; write not")
+    return ~value
+
+
+def dot(guard: Guard, a: Any, b: Any) -> Any:
+    """``np.dot`` of numbers, vectors or matrices."""
+    left, right = np.asarray(numbers(guard, a)), np.asarray(numbers(guard, b))
+    if left.ndim > 2 or right.ndim > 2:
+        raise Refusal("value", "products of arrays with more than two dimensions")
+    shared = left.shape[-1] if left.ndim and right.ndim else 1
+    work = left.size * right.size // max(shared, 1)
+    if work > _MULTIPLICATIONS:
+        raise Refusal("steps", f"a product of {work} multiplications; {_MULTIPLICATIONS} are allowed")
+    guard.room(left.shape[:-1] + right.shape[1:])
+    guard.budget.step(work // 1000)
+    return np.dot(left, right)

@@ -1,0 +1,204 @@
+"""Values of a program made ready for NumPy and Python: converted, counted and refused where they do not fit.
+
+In: a ``Guard`` and a value that it has accepted. Out: the value in the form that an operation needs, its size checked
+before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from voxposer.sandbox.guard import (
+    DType,
+    Guard,
+    Opaque,
+    Record,
+    RecordList,
+    Refusal,
+    kind_of,
+    refuse_kind,
+    require_numbers,
+)
+
+# Numbers in one piece of text.
+_PRINTED = 1000
+# Digits that round() may be asked for.
+_DIGITS = 20
+# Bytes counted for an item put into a list.
+APPENDED_BYTES = 16
+
+DTYPES: Mapping[str, DType] = MappingProxyType(
+    {
+        name: DType(name, dtype)
+        for name, dtype in {
+            "int": np.int64,
+            "float": np.float64,
+            "bool": np.bool_,
+            "np.int64": np.int64,
+            "np.int32": np.int32,
+            "np.float64": np.float64,
+            "np.float32": np.float32,
+            "np.bool_": np.bool_,
+        }.items()
+    }
+)
+
+
+def numbers(guard: Guard, value: Any) -> Any:
+    """A number or array as it is; a list of numbers as an array."""
+    kind = kind_of(value)
+    if kind in ("list", "tuple", "range"):
+        return array(guard, value)
+    return value if kind in ("number", "array") else refuse_kind(value, "numbers")
+
+
+def broadcast(guard: Guard, *values: Any) -> None:
+    """Refuse an operation whose result would be too large."""
+    guard.room(np.broadcast_shapes(*(np.shape(value) for value in values)))
+
+
+def array(guard: Guard, value: Any, dtype: DType | None = None) -> np.ndarray:
+    """``np.array`` of numbers, lists of them or arrays."""
+    if kind_of(value) not in ("number", "array", "list", "tuple", "range"):
+        refuse_kind(value, "numbers")
+    weight = guard.weigh(value)
+    if not weight.kinds <= {"number", "array", "range"}:
+        raise Refusal("types", f"an array of {' and '.join(sorted(weight.kinds))}; only numbers are allowed")
+    guard.room((weight.numbers,))
+    made = np.array(value)
+    require_numbers(made)
+    return made if dtype is None else made.astype(dtype_of(dtype))
+
+
+def dtype_of(dtype: Any) -> type[np.generic]:
+    """The number type that a program named."""
+    if not isinstance(dtype, DType):
+        raise Refusal("types", f"a dtype is one of {', '.join(DTYPES)}")
+    return dtype.dtype
+
+
+def shape_of(guard: Guard, shape: Any) -> tuple[int, ...]:
+    """A shape given as an integer, a list or a tuple."""
+    lengths = shape if isinstance(shape, (tuple, list)) else (shape,)
+    return tuple(operator.index(length) for length in lengths)
+
+
+def count_of(value: Any) -> int:
+    """A number of things that is asked for."""
+    return max(operator.index(value), 0)
+
+
+def number_of(value: Any) -> int | float:
+    """A number as Python's own."""
+    if kind_of(value) != "number":
+        refuse_kind(value, "a number")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def digits_of(value: Any) -> int:
+    """A number of digits, within bounds."""
+    digits = operator.index(value)
+    if abs(digits) > _DIGITS:
+        raise Refusal("size", f"rounding to {digits} digits; {_DIGITS} are allowed")
+    return digits
+
+
+def require_power(guard: Guard, base: Any, exponent: Any) -> None:
+    """Refuse a power of integers that would be too large."""
+    if isinstance(base, int) and isinstance(exponent, int) and exponent > 0 and abs(base) > 1:
+        guard.bits(int(exponent * math.log2(abs(base))))
+
+
+def truth(guard: Guard, value: Any) -> bool:
+    """What ``if value:`` goes by.
+
+    Raises:
+        Refusal: it is an array of several elements.
+    """
+    if isinstance(value, np.ndarray) and value.size != 1:
+        raise Refusal("types", f"an array of {value.size} elements is neither true nor false; use .any() or .all()")
+    if isinstance(value, RecordList):
+        return length_of(guard, value) > 0
+    return True if isinstance(value, (Record, Opaque)) else bool(value)
+
+
+def hashable(guard: Guard, key: Any) -> Any:
+    """A dictionary key: text, a number, None, or a tuple of them."""
+    guard.weigh(key)
+    if not isinstance(key, tuple) and kind_of(key) not in ("text", "number", "None"):
+        refuse_kind(key, "text or a number as the key")
+    return key
+
+
+def iterate(guard: Guard, value: Any) -> Sequence[Any]:
+    """What a loop over the value runs through; ranges, lists and arrays as they are.
+
+    Raises:
+        Refusal: nothing to loop over.
+    """
+    if isinstance(value, dict):
+        return list(value)
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        refuse_kind(value[()], "something to loop over")
+    if isinstance(value, RecordList):
+        return guard.host("the list of observations", list, value)
+    if isinstance(value, (list, tuple, str, range, np.ndarray)):
+        return value  # pyright: ignore[reportReturnType]  (an array is a sequence of its rows)
+    refuse_kind(value, "something to loop over")
+
+
+def listed(guard: Guard, value: Any) -> list[Any]:
+    """The items of a value as a new list."""
+    items = iterate(guard, value)
+    guard.length(len(items))
+    return list(items)
+
+
+def length_of(guard: Guard, value: Any) -> int:
+    """``len(value)``."""
+    if isinstance(value, RecordList):
+        return guard.host("the list of observations", len, value)
+    if isinstance(value, (str, list, tuple, dict, range, np.ndarray)):
+        return len(value)
+    refuse_kind(value, "something with a length")
+
+
+def text(guard: Guard, value: Any, spec: str = "") -> str:
+    """``str(value)``, or a number in a format such as ``.2f``; NumPy's numbers look like Python's.
+
+    Raises:
+        Refusal: it would be too long, or a format is given for something other than a number or text.
+    """
+    weight = guard.weigh(value)
+    guard.characters(weight.characters)
+    if weight.numbers > _PRINTED:
+        raise Refusal("size", f"{weight.numbers} numbers as text; {_PRINTED} are allowed")
+    guard.budget.step(weight.numbers)
+    if spec:
+        if kind_of(value) not in ("number", "text"):
+            refuse_kind(value, "a number or text to format")
+        return format(value.item() if isinstance(value, np.generic) else value, spec)
+    made = str(_plain(guard, value))
+    guard.characters(len(made))
+    return made
+
+
+def _plain(guard: Guard, value: Any) -> Any:
+    """A value whose ``str`` says no more than a program may know, and the same each time."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (list, tuple)):
+        return type(value)(_plain(guard, item) for item in value)
+    if isinstance(value, dict):
+        return {key: _plain(guard, item) for key, item in value.items()}
+    if isinstance(value, Record):
+        return guard.host("the observation", str, value)
+    if isinstance(value, (RecordList, Opaque)):
+        refuse_kind(value, "something with a text")
+    return value
