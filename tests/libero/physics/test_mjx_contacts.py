@@ -20,11 +20,11 @@ from support.paths import DATA
 
 import vecenv
 from vecenv.libero.env import SETTLE_ACTION, LiberoEnv
+from vecenv.libero.physics import private
 from vecenv.libero.physics.colliders import boxbox_jax, planemesh_jax
 from vecenv.libero.physics.colliders.boxbox import box_box
 from vecenv.libero.physics.colliders.boxbox_numba import MOST
 from vecenv.libero.physics.mjx import contacts as mjx_contacts
-from vecenv.libero.physics.mjx import private
 from vecenv.libero.physics.mjx.contacts import MjxContactsError
 from vecenv.libero.physics.mjx.options import jit
 from vecenv.libero.scene import contacts

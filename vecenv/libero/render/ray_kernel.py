@@ -36,7 +36,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from vecenv.libero.physics.mjx.private import pack_rgba_to_uint32, warp_render
+from vecenv.libero.physics.private import pack_rgba_to_uint32, warp_render
 from vecenv.libero.render.flatten import PALETTE
 from vecenv.libero.render.options import RenderError
 from vecenv.libero.render.ray_light import arriving_light
@@ -44,7 +44,7 @@ from vecenv.libero.render.ray_shapes import make_nearest
 from vecenv.libero.render.ray_types import Cameras, Geoms, Hit, Images, Lights, Materials, Ray, Surface
 
 if TYPE_CHECKING:
-    from vecenv.libero.physics.mjx.private import RenderContext
+    from vecenv.libero.physics.private import RenderContext
 
 _MIRROR_TYPES = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_BOX)
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)

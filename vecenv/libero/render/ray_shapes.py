@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import mujoco
 import warp as wp
 
-from vecenv.libero.physics.mjx.private import ray_capsule, ray_cylinder, ray_ellipsoid, ray_sphere
+from vecenv.libero.physics.private import ray_capsule, ray_cylinder, ray_ellipsoid, ray_sphere
 from vecenv.libero.render.ray_types import Geoms, Hit, Ray
 
 _PLANE, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX, _MESH = (

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from vecenv.libero.physics.mjx.private import render_context
+from vecenv.libero.physics.private import render_context
 from vecenv.libero.render.drawing import Pose, View
 from vecenv.libero.render.gl import Frames, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, UserCamera, VisualOptions
@@ -32,7 +32,7 @@ from vecenv.util.mapped import Sized
 from vecenv.util.rotations import quat_to_mat
 
 if TYPE_CHECKING:
-    from vecenv.libero.physics.mjx.private import RenderContext
+    from vecenv.libero.physics.private import RenderContext
 
 _LookKey = tuple[SceneKey, tuple[str, ...], Wanted]
 # Threads of a block on the GPU, registers of a thread, and the tile of pixels, rows and columns, that threads next to

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from vecenv.libero.physics.mjx.private import mat83f, vec8f
+from vecenv.libero.physics.private import mat83f, vec8f
 
 MOST = 8
 # Squared sine below which the cross product of two edges is noise.

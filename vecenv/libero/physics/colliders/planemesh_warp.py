@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from vecenv.libero.physics.mjx.private import Geom, mat43, warp_collision_primitive
+from vecenv.libero.physics.private import Geom, mat43, warp_collision_primitive
 
 MOST = 3
 _APART = 0.3

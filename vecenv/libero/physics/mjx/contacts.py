@@ -24,9 +24,9 @@ import mujoco
 from mujoco import mjx
 
 from vecenv.errors import SimulationError
+from vecenv.libero.physics import private
 from vecenv.libero.physics.colliders import boxbox_jax, planemesh_jax
-from vecenv.libero.physics.mjx import private
-from vecenv.libero.physics.mjx.private import jax_collision_driver
+from vecenv.libero.physics.private import jax_collision_driver
 from vecenv.libero.scene.contacts import MARK, MESH_MARGIN
 
 # The bit of a Warp model's disable flags that asks for published contacts.
