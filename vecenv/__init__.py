@@ -33,6 +33,7 @@ __all__ = [
     "list_suites",
     "list_tasks",
     "make",
+    "make_config",
 ]
 
 # Imported when they are asked for: they bring MuJoCo or SciPy with them.
@@ -81,17 +82,34 @@ def make(
         AssetsMissing: its files are not there.
         KeyError, ValueError, RuntimeError: subclasses that name the suite, task, option or asset that is wrong.
     """
+    if task is not None and tasks is not None:
+        raise OptionError("give task or tasks, not both")
+    made = make_config(suite, fields, config)
+    return registry.family_of(suite).make(suite, tasks if task is None else task, episodes, made)
+
+
+def make_config(
+    suite: str, fields: Mapping[str, object], config: LiberoConfig | SimplerConfig | None = None
+) -> LiberoConfig | SimplerConfig:
+    """The options that ``make`` would build an environment with; nothing is built.
+
+    Args:
+        suite: one of ``list_suites()``.
+        fields: options by their name.
+        config: options to start from; None for the defaults.
+
+    Raises:
+        OptionError: an option that suites of this kind do not have, or a value of a wrong type.
+        KeyError, ValueError: subclasses that name the suite or the value that is wrong.
+    """
     from vecenv.util import configs
 
     chosen = registry.family_of(suite)
     chosen.list_tasks(suite)  # an unknown suite is reported before anything else
-    if task is not None and tasks is not None:
-        raise OptionError("give task or tasks, not both")
     kind = chosen.config_type()
     if config is not None and not isinstance(config, kind):
         raise OptionError(f"{suite}: config is a {type(config).__name__}, expected {kind.__name__}")
-    made = configs.build(kind, fields, config, what=suite, error=OptionError)
-    return chosen.make(suite, tasks if task is None else task, episodes, made)
+    return configs.build(kind, fields, config, what=suite, error=OptionError)
 
 
 def family(suite: str) -> str:

@@ -11,9 +11,10 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vecenv import protocols
+from vecenv import family, protocols
 from vecenv.assets import AssetsMissing
 from vecenv.contract import BatchEnv, ResetInfo
+from vecenv.errors import VecenvError
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.episodes import Batch, Episode, Suite
 from vecenv_eval.simulator import Simulator
@@ -84,17 +85,16 @@ class Environments:
             return self._simulator.make(batch.suite, **arguments)
         except AssetsMissing as error:
             raise ConfigError(str(error)) from error
-        except (ValueError, KeyError, ImportError) as error:
-            # A bare KeyError or ImportError is an accident; a library that refuses a value raises its own subclass.
-            if type(error) in (KeyError, ImportError, ModuleNotFoundError):
-                raise
+        except (VecenvError, ValueError) as error:
             raise ConfigError(f"{type(error).__name__}: {error}") from error
 
 
 def make_arguments(config: EvalConfig) -> dict[str, Any]:
     """Keyword arguments of ``make`` for every batch, without tasks and episodes."""
     arguments = {"backend": config.backend, "num_threads": config.num_threads, **config.env_args}
-    given: dict[str, Any] = {"seed": config.seed, "max_steps": config.max_steps}
+    given: dict[str, Any] = {"max_steps": config.max_steps}
+    if family(config.suite) == protocols.LIBERO:  # SIMPLER's episodes depend on their number alone
+        given["seed"] = config.seed
     if config.protocol != protocols.DEFAULT:
         given["protocol"] = config.protocol
     return {**arguments, **{name: value for name, value in given.items() if value is not None}}

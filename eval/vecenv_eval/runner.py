@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vecenv import family, protocols
+from vecenv.errors import VecenvError
 from vecenv.placement import episode_indices
 from vecenv_eval.batches import BatchLoop
 from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
@@ -151,7 +152,8 @@ def _check_make(simulator: Simulator, config: EvalConfig) -> None:
     """Fail before the first batch when ``make`` does not know an argument."""
     try:
         inspect.signature(simulator.make).bind(config.suite, tasks=[], episodes=[], **make_arguments(config))
-    except TypeError as error:
+        simulator.check(config.suite, make_arguments(config))
+    except (TypeError, VecenvError) as error:
         raise ConfigError(f"environment arguments: {error}") from None
 
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import vecenv
@@ -26,15 +26,17 @@ class Simulator:
     Attributes:
         suite: describes a suite under a protocol, both by name, or raises ``ConfigError``.
         make: builds an environment, as ``vecenv.make`` does: ``tasks`` times ``episodes`` slots.
+        check: raises a ``VecenvError`` for options that ``make`` would refuse, without building anything.
     """
 
     suite: Callable[[str, str], Suite]
     make: Callable[..., BatchEnv]
+    check: Callable[[str, Mapping[str, object]], object] = lambda suite, options: None
 
 
 def vecenv_simulator() -> Simulator:
     """``vecenv`` itself."""
-    return Simulator(describe_suite, vecenv.make)
+    return Simulator(describe_suite, vecenv.make, vecenv.make_config)
 
 
 def describe_suite(name: str, protocol: str = protocols.DEFAULT) -> Suite:
