@@ -10,9 +10,9 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-from support.fakes import FakeEnv
 from websockets.sync.server import ServerConnection, serve
 
+from support.fakes import FakeEnv
 from vecenv.contract import Egocentric
 from vecenv.placement import Placement
 

@@ -81,6 +81,7 @@ class ZmqLink:
     def _open(self) -> None:
         socket = zmq.Context.instance().socket(zmq.REQ)
         self._socket, self._monitor = socket, socket.get_monitor_socket(_LOST_EVENTS)
+        socket.setsockopt(zmq.CONNECT_TIMEOUT, round(self._config.connect_timeout_s * 1000))
         socket.connect(f"tcp://{self._config.address}")
 
     def _exchange(self, message: bytes) -> bytes:

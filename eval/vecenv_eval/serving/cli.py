@@ -47,4 +47,4 @@ def serve_policy_command(
     except OSError as error:
         fail(f"cannot listen on {host}: {error}", code=1)
     except KeyboardInterrupt:
-        server.stop()
+        typer.echo("stopped")

@@ -119,7 +119,9 @@ def test_retries_are_bounded() -> None:
     env = SeeingEnv([1], [0])
     with websocket_host(drop) as host:
         policy = started(policy_of(host.port), env)
-        with pytest.raises(PolicyServerError, match=rf"openpi at 127.0.0.1:{host.port}: no connection after 3 attempts"):
+        with pytest.raises(
+            PolicyServerError, match=rf"openpi at 127.0.0.1:{host.port}: no connection after 3 attempts"
+        ):
             policy.act(env)
         assert host.connections == 3
 
@@ -134,7 +136,7 @@ def test_a_text_message_is_the_servers_error() -> None:
     def fail(host: WebSocketHost, connection: ServerConnection, number: int) -> None:
         connection.send(numpy_msgpack.pack({}))
         connection.recv()
-        connection.send('Traceback (most recent call last):\n  File "policy.py"\nKeyError: \'observation/state\'\n')
+        connection.send("Traceback (most recent call last):\n  File \"policy.py\"\nKeyError: 'observation/state'\n")
 
     env = SeeingEnv([1], [0])
     with websocket_host(fail) as host:
@@ -273,5 +275,7 @@ def test_the_harness_counts_a_server_that_fails_as_errors_not_as_failures(tmp_pa
         result = evaluate(config, begin(config, tmp_path / "results"), simulator=make)
     assert [record.error != "" for record in result.records] == [False] * 4 + [True]
     assert all(record.success for record in result.records if not record.error)
-    assert result.causes == (f"PolicyServerError: policy server openpi at 127.0.0.1:{host.port}: it reports an error: "
-                             "RuntimeError: out of memory",)
+    assert result.causes == (
+        f"PolicyServerError: policy server openpi at 127.0.0.1:{host.port}: it reports an error: "
+        "RuntimeError: out of memory",
+    )
