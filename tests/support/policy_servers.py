@@ -13,7 +13,7 @@ import numpy as np
 from websockets.sync.server import ServerConnection, serve
 
 from support.fakes import FakeEnv
-from vecenv.contract import Egocentric
+from vecenv.contract import Egocentric, State, Watcher
 from vecenv.placement import Placement
 
 SIZE = 64
@@ -25,6 +25,16 @@ class SeeingEnv(FakeEnv):
     """``FakeEnv`` with cameras: the image of a slot is of one colour, its number, plus the tick in the wrist image."""
 
     suite = "fake_suite"
+    config, control_hz = None, 20.0
+
+    def state(self) -> State:
+        raise NotImplementedError
+
+    def set_state(self, state: State) -> None:
+        raise NotImplementedError
+
+    def watched(self, watcher: Watcher) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
 
     @property
     def done(self) -> np.ndarray:
@@ -84,6 +94,13 @@ def websocket_host(handle: Callable[[WebSocketHost, ServerConnection, int], None
         yield host
         server.shutdown()
         thread.join()
+
+
+def messages(connection: ServerConnection) -> Iterator[bytes]:
+    """The binary messages of a connection, until it is closed."""
+    for message in connection:
+        assert isinstance(message, bytes)
+        yield message
 
 
 @contextlib.contextmanager

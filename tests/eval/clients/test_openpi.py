@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.fakes import FakeWorld
-from support.policy_servers import QUICK, SeeingEnv, WebSocketHost, chunk, free_port, websocket_host
+from support.policy_servers import QUICK, SeeingEnv, WebSocketHost, chunk, free_port, messages, websocket_host
 from vecenv_eval.clients.codecs import numpy_msgpack
 from vecenv_eval.clients.errors import PolicyServerError
 from vecenv_eval.clients.openpi import OpenPiPolicy
@@ -25,7 +25,7 @@ def answer_all(host: WebSocketHost, connection: ServerConnection, number: int) -
     """Metadata, then chunks whose numbers count the requests: 0.1 for the first, 0.2 for the second."""
     del number
     connection.send(numpy_msgpack.pack({"model": "fake"}))
-    for message in connection:
+    for message in messages(connection):
         host.seen.append(numpy_msgpack.unpack(message))
         connection.send(numpy_msgpack.pack({"actions": chunk(len(host.seen) / 10)}))
 
@@ -141,7 +141,7 @@ def test_a_text_message_is_the_servers_error() -> None:
     env = SeeingEnv([1], [0])
     with websocket_host(fail) as host:
         policy = started(policy_of(host.port), env)
-        with pytest.raises(PolicyServerError, match="it reports an error: KeyError: 'observation/state'$"):
+        with pytest.raises(PolicyServerError, match=r"it reports an error: KeyError: 'observation/state'$"):
             policy.act(env)
         assert host.connections == 1
 
@@ -213,7 +213,7 @@ def test_several_connections_have_several_requests_in_flight() -> None:
 
     def meet(host: WebSocketHost, connection: ServerConnection, number: int) -> None:
         connection.send(numpy_msgpack.pack({}))
-        for message in connection:
+        for message in messages(connection):
             slot = numpy_msgpack.unpack(message)["observation/image"][0, 0, 0]
             together.wait()
             connection.send(numpy_msgpack.pack({"actions": chunk(float(slot))}))

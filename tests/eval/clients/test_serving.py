@@ -46,9 +46,8 @@ def colour(observation: Observation) -> float:
 class Painter:
     """Answers chunks whose first numbers are the colours that it sees."""
 
-    metadata = {"model": "painter"}
-
     def __init__(self) -> None:
+        self.metadata = {"model": "painter"}
         self.seen: list[Observation] = []
         self.resets = 0
 

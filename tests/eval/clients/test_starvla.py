@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.policy_servers import QUICK, SeeingEnv, WebSocketHost, chunk, websocket_host
+from support.policy_servers import QUICK, SeeingEnv, WebSocketHost, chunk, messages, websocket_host
 from vecenv_eval.clients.codecs import numpy_msgpack
 from vecenv_eval.clients.errors import PolicyServerError
 from vecenv_eval.policies import Policy, make_policy
@@ -15,7 +15,7 @@ from websockets.sync.server import ServerConnection
 
 def answer_all(host: WebSocketHost, connection: ServerConnection, number: int) -> None:
     connection.send(numpy_msgpack.pack({"action_chunk_size": 3, "available_unnorm_keys": ["franka"]}))
-    for message in connection:
+    for message in messages(connection):
         host.seen.append(request := numpy_msgpack.unpack(message))
         actions = np.stack([chunk(float(example["image"][0][0, 0, 0]), 8) for example in request["examples"]])
         data = {"status": "ok", "ok": True, "type": "inference_result", "data": {"actions": actions}}
