@@ -2,7 +2,7 @@
 
 Each needs a venv of its own (openpi-client wants NumPy 1), named by VECENV_OPENPI_PYTHON and VECENV_VLA_EVAL_PYTHON::
 
-    python -m venv .venv-openpi && .venv-openpi/bin/pip install openpi-client==0.1.2
+    python -m venv .venv-openpi && .venv-openpi/bin/pip install openpi-client==0.1.2 typing_extensions
     python -m venv .venv-vla-eval && .venv-vla-eval/bin/pip install vla-eval==0.8.0
 """
 
@@ -100,7 +100,7 @@ async def main():
     await connection.connect(benchmark="libero")
     image = np.full((256, 256, 3), 4, np.uint8)
     await connection.start_episode({"task": {"name": "go"}})
-    actions = [await connection.act({"images": {"agentview": image}, "task_description": "go"}) for _ in range(3)]
+    actions = [await connection.act({"images": {"agentview": image}, "task_description": "go"}) for _ in range(4)]
     await connection.end_episode({"metrics": {"success": True}})
     try:
         await connection.act({"images": {}})
@@ -120,7 +120,7 @@ def test_vla_evals_own_connection_is_served() -> None:
         said = run(interpreter, VLA_EVAL_CLIENT, port)
     assert said["hello"]["model_server"] == "Echo"
     assert said["hello"]["observation_params"] == {"send_wrist_image": True, "send_state": True}
-    np.testing.assert_allclose(said["actions"], [4, 4.01, 4], atol=1e-6)
+    np.testing.assert_allclose(said["actions"], [4, 4.01, 4, 4.01], atol=1e-6)
     assert "observation_failed: KeyError: 'agentview'" in said["error"]
 
 
