@@ -94,7 +94,8 @@ def test_a_users_own_policy_goes_by_module_and_class(my_module: str) -> None:
         (
             "qqq",
             {},
-            "unknown policy 'qqq': did you mean gr00t, openpi, pick_place, random, simpler_scripted, starvla, vla-eval, voxposer, zero",
+            "unknown policy 'qqq': did you mean gr00t, openpi, pick_place, random, simpler_scripted, starvla, "
+            "vla-eval, voxposer, zero",
         ),
         ("module:", {}, "unknown policy 'module:'"),
         ("no_such_module:Class", {}, "importing 'no_such_module' failed: ModuleNotFoundError"),
