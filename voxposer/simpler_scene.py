@@ -137,9 +137,9 @@ class HandView:
         """Verdicts."""
         return self.env.evaluate()
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
         """Cameras and joints."""
-        return self.env.observe_egocentric()
+        return self.env.observe_egocentric(slots)
 
     def close(self) -> None:
         """Release the simulator."""
@@ -167,9 +167,9 @@ class HandView:
         )
         return replace(control, final_pose=hand_poses(control.final_pose))
 
-    def observe_objects(self, points: str = "surface") -> Objects:
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
         """Ground truth about the hand, under the names of the instructions."""
-        seen = self.env.observe_objects(points)
+        seen = self.env.observe_objects(points, slots)
         return replace(seen, snapshot=tuple(each and view(each) for each in seen.snapshot))
 
 

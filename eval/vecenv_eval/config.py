@@ -122,6 +122,12 @@ class EvalConfig:
     record_states: bool = field(
         default=False, metadata=_about("Keep the states too; implies --record.", resumable=True)
     )
+    retries: int = field(
+        default=1,
+        metadata=_about(
+            "How often episodes that ended in an error run again in the same run.", minimum=0, resumable=True
+        ),
+    )
     fail_fast: bool = field(default=False, metadata=_about("Stop at the first batch that raises.", resumable=True))
 
     def __post_init__(self) -> None:

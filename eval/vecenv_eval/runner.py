@@ -105,11 +105,15 @@ class Evaluation:
             index=len(content["runs"]),
         )
         try:
-            interrupted = loop.run(self.streams(store.done()))
+            interrupted = loop.run(self.streams(store.done()), self._again)
         except ConfigError:
             store.discard()
             raise
         return self._summarise(store, interrupted, tuple(loop.causes))
+
+    def _again(self, episodes: Collection[Episode]) -> list[Stream]:
+        """Streams of these episodes alone."""
+        return self.streams(done=frozenset(self.planned) - frozenset(episodes))
 
     def _summarise(self, store: ResultStore, interrupted: bool, causes: tuple[str, ...]) -> EvalResult:
         """Write the summary of all records in the folder, and return it with them."""
