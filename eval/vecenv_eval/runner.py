@@ -18,7 +18,7 @@ from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
 from vecenv_eval.loop import EpisodeLoop
-from vecenv_eval.policies import Refillable, make_policy
+from vecenv_eval.policies import Closing, Refillable, make_policy
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.report import markdown, summarise
 from vecenv_eval.results import EvalResult, Progress, begin
@@ -109,6 +109,9 @@ class Evaluation:
         except ConfigError:
             store.discard()
             raise
+        finally:
+            if isinstance(self.policy, Closing):
+                self.policy.close()
         return self._summarise(store, interrupted, tuple(loop.causes))
 
     def _again(self, episodes: Collection[Episode]) -> list[Stream]:

@@ -87,6 +87,15 @@ class Refillable(Protocol):
 
 
 @runtime_checkable
+class Closing(Protocol):
+    """A policy that holds connections or files; optional."""
+
+    def close(self) -> None:
+        """Release them; called when the run ends, however it ends."""
+        ...
+
+
+@runtime_checkable
 class Ending(Protocol):
     """A policy that learns how episodes end, to log or to learn; optional."""
 
