@@ -203,7 +203,7 @@ class Lmps:
 
     # Writing programs
 
-    def _write(self, name: str, query: Any) -> _Written:
+    def _write(self, name: str, query: object) -> _Written:
         """The program for a query, asked of the model."""
         config, words = self._configs[name], self._words(name, query)
         context = self._context(config, words)
@@ -217,7 +217,7 @@ class Lmps:
             call.prompt_tokens, call.completion_tokens = reply.prompt_tokens, reply.completion_tokens
             return _Written(config=config, query=words, program=self._parsed(call, reply.text), call=call)
 
-    def _words(self, name: str, query: Any) -> str:
+    def _words(self, name: str, query: object) -> str:
         """A query as one line without the suffix."""
         if not isinstance(query, str):
             raise LmpError(name, str(query)[:80], "query", f"a query is text, not {type(query).__name__}")
@@ -363,7 +363,7 @@ def _parse(code: str, limits: Limits) -> Program:
 def _recorder(subtasks: list[str]) -> Callable[[Any], None]:
     """A composer that only writes down what it is asked."""
 
-    def composer(query: Any) -> None:
+    def composer(query: object) -> None:
         if not isinstance(query, str):
             raise TypeError(f"a subtask is text, not {type(query).__name__}")
         if len(subtasks) == _SUBTASKS:
@@ -373,14 +373,14 @@ def _recorder(subtasks: list[str]) -> Callable[[Any], None]:
     return composer
 
 
-def _static(value: Any) -> Observation | None:
+def _static(value: object) -> Observation | None:
     """An observation as it is now; None for what is none."""
     if isinstance(value, DynamicObservation):
         return value()
     return value if isinstance(value, Observation) else None
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"an array {list(value.shape)}"
     return "nothing" if value is None else f"{type(value).__name__} {str(value)[:80]!r}"

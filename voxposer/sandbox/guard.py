@@ -199,7 +199,7 @@ class Guard:
         if count > self.limits.integer_bits:
             raise Refusal("size", f"an integer of more than {self.limits.integer_bits} bits")
 
-    def take(self, value: Any) -> Any:
+    def take(self, value: object) -> Any:
         """A value that has just been made, checked and its memory counted; views count as what they show."""
         if isinstance(value, np.ndarray):
             require_numbers(value)
@@ -218,7 +218,7 @@ class Guard:
             kind_of(value)
         return value
 
-    def take_all(self, value: Any) -> Any:
+    def take_all(self, value: object) -> Any:
         """A function's result: a list's or tuple's items are taken too."""
         if isinstance(value, (list, tuple)):
             self.weigh(value)
@@ -226,7 +226,7 @@ class Guard:
                 self.take(item)
         return self.take(value)
 
-    def host(self, name: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    def host(self, name: str, function: Callable[..., Any], *arguments: object, **named: object) -> Any:
         """What a function of the host returns, its time not counted.
 
         Raises:
@@ -244,7 +244,7 @@ class Guard:
         given = any(value is argument for argument in (*arguments, *named.values()))
         return value if given else self.take_all(value)
 
-    def weigh(self, value: Any) -> Weight:
+    def weigh(self, value: object) -> Weight:
         """What a value holds, its lists' lists included, each counted wherever it appears.
 
         Shared lists can stand for exponentially many items, and a list may hold itself: what is handed to a function
@@ -291,7 +291,7 @@ def _children(container: list[Any] | tuple[Any, ...] | dict[Any, Any]) -> Iterab
     return [*container.keys(), *container.values()] if isinstance(container, dict) else container
 
 
-def _numbers_in(leaf: Any) -> int:
+def _numbers_in(leaf: object) -> int:
     if isinstance(leaf, np.ndarray):
         return leaf.size
     return len(leaf) if isinstance(leaf, range) else 1
@@ -310,7 +310,7 @@ _KINDS: dict[type, str] = {
 }
 
 
-def kind_of(value: Any) -> str:
+def kind_of(value: object) -> str:
     """What a program calls this value: number, array, text, list, tuple, dictionary, range, observation, map, None.
 
     Raises:
@@ -336,7 +336,7 @@ def require_numbers(value: np.ndarray | np.generic) -> None:
         raise Refusal("values", f"an array of {value.dtype}; only truth values, integers and floats are allowed")
 
 
-def refuse_kind(value: Any, wanted: str) -> NoReturn:
+def refuse_kind(value: object, wanted: str) -> NoReturn:
     """Refuse a value where another kind is wanted."""
     raise Refusal("types", f"expected {wanted}, got {_article(kind_of(value))}")
 

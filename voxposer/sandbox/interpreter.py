@@ -198,7 +198,7 @@ class _Run:
         jumps = [self._store(target, value) for target in node.targets]
         return next((jump for jump in jumps if jump is not None), None)
 
-    def _store(self, target: ast.expr, value: Any) -> _Jump | None:
+    def _store(self, target: ast.expr, value: object) -> _Jump | None:
         """Put a value in its place; tells if that is a return."""
         if isinstance(target, ast.Name):
             return self._bind(target.id, value)
@@ -209,7 +209,7 @@ class _Run:
         indexing.assign(self._guard, container, self._eval(target.slice), value)
         return None
 
-    def _bind(self, name: str, value: Any) -> _Jump | None:
+    def _bind(self, name: str, value: object) -> _Jump | None:
         if name in _MODULE_NAMES:
             raise Refusal("names", f"{name!r} cannot be assigned to: it is part of the language")
         kind_of(value)
@@ -219,7 +219,7 @@ class _Run:
             return _Jump.RETURN
         return None
 
-    def _unpack(self, targets: Sequence[ast.expr], value: Any) -> _Jump | None:
+    def _unpack(self, targets: Sequence[ast.expr], value: object) -> _Jump | None:
         items = values.iterate(self._guard, value)
         if len(items) != len(targets):
             raise Refusal("value", f"{len(items)} values for {len(targets)} names")
@@ -306,7 +306,7 @@ class _Run:
         is_numpy = isinstance(base, ast.Name) and base.id in _MODULE_NAMES
         return ".".join(reversed(names)) if is_numpy else None
 
-    def _field(self, record: Record, name: Any) -> Any:
+    def _field(self, record: Record, name: object) -> Any:
         if not isinstance(name, str) or name.startswith("_"):
             raise Refusal("attributes", f"an observation's fields are named; {name!r} is none of them")
         try:
@@ -327,7 +327,7 @@ class _Run:
     def _binary(self, node: ast.BinOp) -> Any:
         return self._arithmetic(SYMBOLS[type(node.op)], self._eval(node.left), self._eval(node.right))
 
-    def _arithmetic(self, symbol: str, left: Any, right: Any, in_place: bool = False) -> Any:
+    def _arithmetic(self, symbol: str, left: object, right: object, in_place: bool = False) -> Any:
         made = operators.arithmetic(self._guard, symbol, left, right, in_place)
         return made if made is left else self._guard.take(made)
 
@@ -433,7 +433,7 @@ class _Run:
         return lambda *arguments, **named: self._guard.take_all(function(self._guard, *arguments, **named))
 
     def _of_host(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **named: Any) -> Any:
+        def call(*arguments: object, **named: object) -> Any:
             self._guard.weigh([*arguments, *named.values()])
             return self._guard.host(name, function, *arguments, **named)
 
