@@ -9,11 +9,12 @@ for that robot. Things get the names that the instructions use. Nothing of the t
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.actions import GRIPPER
 from vecenv.contract import (
@@ -27,11 +28,14 @@ from vecenv.contract import (
     PlanControl,
     PointCloud,
     ResetInfo,
+    State,
+    Watcher,
 )
 from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.routes import RouteConfig
 from vecenv.manipulation.world import Margins, matrix
+from vecenv.placement import Placement
 from voxposer.agent import AgentConfig
 from voxposer.perception.config import PerceptionConfig
 from voxposer.planning.plan import PlanConfig, SubtaskPlan
@@ -121,21 +125,57 @@ class HandView:
     """
 
     def __init__(self, env: BatchEnv) -> None:
-        self.env, self.num_envs = env, env.num_envs
-        option = getattr(getattr(env, "config", None), "gripper", _NATIVE)
+        self.env, self.suite, self.num_envs = env, env.suite, env.num_envs
+        option = getattr(env.config, "gripper", _NATIVE)
         self._gripper = GRIPPER[SUITE if option == _NATIVE else option]
+
+    @property
+    def config(self) -> object:
+        """The environment's options."""
+        return self.env.config
+
+    @property
+    def control_hz(self) -> float:
+        """Control ticks a second."""
+        return self.env.control_hz
+
+    @property
+    def placement(self) -> Placement:
+        """Task and episode of each slot."""
+        return self.env.placement
+
+    @property
+    def done(self) -> np.ndarray:
+        """Which slots have finished their episode, bool [B]."""
+        return self.env.done
+
+    def instructions(self) -> tuple[str, ...]:
+        """The present instruction of each slot."""
+        return self.env.instructions()
 
     def reset(self) -> ResetInfo:
         """Make every slot live."""
         return self.env.reset()
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+    def set_episodes(self, *, tasks: npt.ArrayLike | None = None, episodes: npt.ArrayLike | None = None) -> None:
         """Choose what each slot runs next."""
         self.env.set_episodes(tasks=tasks, episodes=episodes)
 
     def evaluate(self) -> Metrics:
         """Verdicts."""
         return self.env.evaluate()
+
+    def state(self) -> State:
+        """Physics state of every slot, a copy."""
+        return self.env.state()
+
+    def set_state(self, state: State) -> None:
+        """Overwrite the physics state of every slot."""
+        self.env.set_state(state)
+
+    def watched(self, watcher: Watcher) -> AbstractContextManager[None]:
+        """While inside, ``watcher`` is called before every tick of an episode."""
+        return self.env.watched(watcher)
 
     def observe_egocentric(self) -> Egocentric:
         """Cameras and joints."""
@@ -145,19 +185,19 @@ class HandView:
         """Release the simulator."""
         self.env.close()
 
-    def step_continuous(self, actions: Any) -> Control:
+    def step_continuous(self, actions: npt.ArrayLike) -> Control:
         """Advance; the gripper column is LIBERO's."""
         column = self._gripper
-        actions = np.array(actions, float)
-        actions[..., 6] = np.where(actions[..., 6] > 0, column.closed, column.open)
-        return self.env.step_continuous(actions)
+        converted = np.array(actions, float)
+        converted[..., 6] = np.where(converted[..., 6] > 0, column.closed, column.open)
+        return self.env.step_continuous(converted)
 
-    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+    def step_ee_pose(self, poses: npt.ArrayLike, hold_steps: npt.ArrayLike = 0) -> EePoseControl:
         """Drive the hand to poses, [B, 8]; what comes back speaks of the hand too."""
-        poses = np.array(poses, float)
-        if poses.size:
-            poses[..., :7] = tool_poses(poses[..., :7])
-        control = self.env.step_ee_pose(poses, hold_steps)
+        converted = np.array(poses, float)
+        if converted.size:
+            converted[..., :7] = tool_poses(converted[..., :7])
+        control = self.env.step_ee_pose(converted, hold_steps)
         return replace(control, final_pose=hand_poses(control.final_pose))
 
     def step_waypoints(self, plan: SubtaskPlan, max_misses: int | None = None) -> PlanControl:

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num, Shaped
 
@@ -272,7 +273,7 @@ def _min_plus(squares: jax.Array, axis: int) -> jax.Array:
     return lax.fori_loop(0, n, row, most, unroll=min(_ROWS_AT_ONCE, n))
 
 
-def _of_rank(rank: int, *arrays: Any) -> tuple[Any, ...]:
+def _of_rank(rank: int, *arrays: AnyArray) -> tuple[Any, ...]:
     """Arrays with leading axes of length 1, so that they have this rank."""
     return tuple(array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays)
 
@@ -281,15 +282,15 @@ def _float() -> Any:
     return jnp.zeros(0).dtype
 
 
-def _bits(dtype: Any) -> Any:
+def _bits(dtype: npt.DTypeLike) -> Any:
     return jnp.int64 if dtype == jnp.float64 else jnp.int32
 
 
-def _namespace(array: Any) -> Any:
+def _namespace(array: object) -> Any:
     return jnp if isinstance(array, jax.Array) else np
 
 
-def _require_bounds(points: Any, lower: Any, upper: Any) -> None:
+def _require_bounds(points: object, lower: object, upper: object) -> None:
     if isinstance(lower, np.ndarray) and isinstance(upper, np.ndarray) and not (upper > lower).all():
         raise ValueError(f"a workspace needs upper > lower on every axis, got {lower.tolist()} and {upper.tolist()}")
     if isinstance(points, np.ndarray) and not np.isfinite(points).all():

@@ -13,12 +13,14 @@ descent in ``planner_numba``, which finds the same voxels several times quicker.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Num, Shaped
@@ -94,7 +96,9 @@ def optimize_paths(
         return _with_jax(*arrays, config)
 
 
-def _checked(start: Any, target: Any, obstacle: Any, object_centric: Any) -> tuple[Any, Any, Any, Any]:
+def _checked(
+    start: npt.ArrayLike, target: npt.ArrayLike, obstacle: npt.ArrayLike, object_centric: npt.ArrayLike
+) -> tuple[Any, Any, Any, Any]:
     arrays = tuple(x if isinstance(x, jax.Array) else np.asarray(x) for x in (start, target, obstacle, object_centric))
     slots, size = arrays[0].shape[:1], arrays[1].shape[-1:]
     wanted = {"start": (*slots, 3), "target": (*slots, *size * 3), "obstacle": (*slots, *size * 3)}
@@ -106,7 +110,7 @@ def _checked(start: Any, target: Any, obstacle: Any, object_centric: Any) -> tup
     return cast(tuple[Any, Any, Any, Any], arrays)
 
 
-def _on_cpu(arrays: tuple[Any, ...]) -> bool:
+def _on_cpu(arrays: Sequence[maps.AnyArray]) -> bool:
     placed = [device.platform for array in arrays if isinstance(array, jax.Array) for device in array.devices()]
     return all(platform == "cpu" for platform in placed or [jax.default_backend()])
 
@@ -115,7 +119,13 @@ def _on_cpu(arrays: tuple[Any, ...]) -> bool:
 # The two engines of the raw path.
 
 
-def _with_numba(start: Any, target: Any, obstacle: Any, planar: Any, config: PlannerConfig) -> Paths:
+def _with_numba(
+    start: Num[maps.AnyArray, "B 3"],
+    target: Shaped[maps.AnyArray, "B N N N"],
+    obstacle: Shaped[maps.AnyArray, "B N N N"],
+    planar: Shaped[maps.AnyArray, " B"],
+    config: PlannerConfig,
+) -> Paths:
     target, obstacle, planar = np.asarray(target), np.asarray(obstacle), np.asarray(planar, bool)
     raw, length, fault = planner_numba.descend(np.asarray(start), target, obstacle, planar, config)
     path, path_length = _shape(raw, length, config, target.shape[-1])
@@ -124,13 +134,19 @@ def _with_numba(start: Any, target: Any, obstacle: Any, planar: Any, config: Pla
 
 
 @partial(jax.jit, static_argnames="config")
-def _with_jax(start: Any, target: Any, obstacle: Any, planar: Any, config: PlannerConfig) -> Paths:
+def _with_jax(
+    start: Num[maps.AnyArray, "B 3"],
+    target: Shaped[maps.AnyArray, "B N N N"],
+    obstacle: Shaped[maps.AnyArray, "B N N N"],
+    planar: Shaped[maps.AnyArray, " B"],
+    config: PlannerConfig,
+) -> Paths:
     plan = partial(_plan, config=config)
     arrays = start, target, obstacle, planar.astype(bool)
     return lax.platform_dependent(*arrays, cpu=partial(_in_parts, plan, 1), default=partial(_in_parts, plan, None))
 
 
-def _in_parts(plan: Any, at_once: int | None, *arrays: jax.Array) -> Paths:
+def _in_parts(plan: Callable[..., Paths], at_once: int | None, *arrays: jax.Array) -> Paths:
     """Apply ``plan`` to some slots after the other, which bounds the memory."""
     slots = len(arrays[0])
     if not slots:
@@ -287,7 +303,9 @@ def _finish(
 ) -> Paths:
     """Lead each path to its ``end`` [B, 3] where ``snap`` [B] says so, thin out those of objects, and pack up."""
 
-    def one(path: jax.Array, length: jax.Array, last: jax.Array, end: jax.Array, snap: jax.Array, planar: Any) -> Any:
+    def one(
+        path: jax.Array, length: jax.Array, last: jax.Array, end: jax.Array, snap: jax.Array, planar: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         height = jnp.where(planar, jnp.clip(jnp.round(last[2]), 0, size - 1), end[2])
         path = jnp.concatenate([path, path[-1:]])
         behind = (jnp.arange(len(path)) >= length)[:, None]

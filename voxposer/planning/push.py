@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -300,7 +300,7 @@ def _unit(vectors: Float[Array, "*B 3"]) -> Float[Array, "*B 3"]:
     return jnp.where(length > _NO_WAY, vectors / jnp.where(length > _NO_WAY, length, 1), 0)
 
 
-def _heights(limit: Any, default: Any, slots: int) -> jax.Array:
+def _heights(limit: Num[AnyArray, " B"] | float | None, default: float, slots: int) -> jax.Array:
     return jnp.broadcast_to(jnp.asarray(default if limit is None else limit, jnp.float32), (slots,))
 
 
