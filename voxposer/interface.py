@@ -158,13 +158,9 @@ class Interface:
         seen = _now(movable)
         name = str(seen["name"])
         object_centric = name.lower() not in HAND_ALIASES
-        targets = None if affordance_map is None else self._map(affordance_map, "affordance map") >= 0.999
-        if targets is not None and not targets.any():
-            raise InterfaceError("the affordance map has no target: no voxel is 1")
-        if targets is None and object_centric:
-            raise InterfaceError(f"{name} is to move, but there is no affordance map with its target")
-        if object_centric and name not in self.perception.snapshot.movable:
-            raise InterfaceError(f"{name} cannot be pushed: it is fixed")
+        targets = None if affordance_map is None else self._targets(affordance_map)
+        if object_centric:
+            self._require_pushable(name, targets)
         request = MotionRequest(
             kind="stay" if targets is None else "path",
             movable=name,
@@ -201,6 +197,18 @@ class Interface:
             pos = self.perception.position_of(end)
         self.perception.move_hand(pos, matrix(request.rotation_at(end)))
         self._closed = request.closed_at_end(end)
+
+    def _targets(self, given: VoxelMap) -> np.ndarray:
+        targets = self._map(given, "affordance map") >= 0.999
+        if not targets.any():
+            raise InterfaceError("the affordance map has no target: no voxel is 1")
+        return targets
+
+    def _require_pushable(self, name: str, targets: np.ndarray | None) -> None:
+        if targets is None:
+            raise InterfaceError(f"{name} is to move, but there is no affordance map with its target")
+        if name not in self.perception.snapshot.movable:
+            raise InterfaceError(f"{name} cannot be pushed: it is fixed")
 
     def _map(self, given: VoxelMap, what: str, *tail: int) -> np.ndarray:
         value = np.asarray(_now(given))

@@ -16,7 +16,7 @@ from vecenv.util.rotations import quat_to_mat
 from voxposer.planning import push
 from voxposer.planning.push import PushConfig, best_push, push_waypoints
 
-pytestmark = pytest.mark.usefixtures("explicit_ranks")
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 
 # Few samples suffice where the best of them is not the question.
 FEW = PushConfig(num_samples=300)

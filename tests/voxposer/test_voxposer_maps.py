@@ -15,7 +15,7 @@ from support import voxposer_reference as reference
 
 from voxposer.planning import maps
 
-pytestmark = pytest.mark.usefixtures("explicit_ranks")
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 
 LOWER, UPPER = np.array([-0.7, -0.4, 0.812]), np.array([0.3, 0.5, 1.262])
 # SciPy's wheels for other machines may fuse multiplications and additions.

@@ -17,6 +17,8 @@ from vecenv.manipulation.routes import RouteConfig, Stop, corners, is_contact_mo
 from vecenv.manipulation.world import Margins, SceneGeometry
 from voxposer.planning.plan import PlanConfig, PlannedWaypoint, expand_flips, remaining, slowed, stack
 
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
+
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])
 CONFIG = PlanConfig(settle=2, lengths=4)
 

@@ -19,7 +19,7 @@ from voxposer.planning import planner
 from voxposer.planning.config import Fault, PlannerConfig
 from voxposer.planning.planner import Paths, optimize_paths
 
-pytestmark = pytest.mark.usefixtures("explicit_ranks")
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 
 Engine = Literal["jax", "numba"]
 ENGINES: tuple[Engine, ...] = ("jax", "numba")

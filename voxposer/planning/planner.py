@@ -207,6 +207,12 @@ class _Descent(NamedTuple):
     length: jax.Array
 
 
+def _surroundings(padded: Float[Array, "B P P P"], here: Int[Array, "B 3"], margin: int) -> Float[Array, "B K"]:
+    """Costs around voxels, from volumes padded by ``margin``, in the order of ``neighbour_offsets``."""
+    block = (2 * margin + 1,) * 3
+    return jax.vmap(lambda cost, at: lax.dynamic_slice(cost, at, block))(padded, here).reshape(len(here), -1)
+
+
 def _descend(
     start: Int[Array, "B 3"], cost: Float[Array, "B N N N"], planar: Bool[Array, " B"], config: PlannerConfig
 ) -> tuple[Int[Array, "B steps 3"], Int[Array, " B"]]:
@@ -221,10 +227,6 @@ def _descend(
     # Beyond the border everything costs infinitely much, which is as good as not being there.
     padded = jnp.pad(cost, [(0, 0), *[(margin, margin)] * 3], constant_values=jnp.inf)
 
-    def surroundings(cost: jax.Array, here: jax.Array) -> jax.Array:
-        block = (2 * margin + 1,) * 3
-        return jax.vmap(lambda c, at: lax.dynamic_slice(c, at, block))(cost, here).reshape(len(slots), -1)
-
     def candidates(around: jax.Array, here: jax.Array, flat: jax.Array) -> jax.Array:
         # Upstream takes out the voxel itself before clipping to the grid, and clipping at a border brings it back.
         edge = (here == 0) | (here == size - 1)
@@ -237,7 +239,7 @@ def _descend(
         there = jnp.where(d.active[:, None], d.here + offsets[choice], d.here)
         x, y, z = (d.here + margin).T
         cost = d.cost.at[slots, x, y, z].add(d.active.astype(d.cost.dtype), unique_indices=True)
-        around = surroundings(cost, there)
+        around = _surroundings(cost, there, margin)
         worth = candidates(around, there, jnp.zeros_like(planar)) < around[:, middle, None] + config.stop_threshold
         raw = lax.dynamic_update_index_in_dim(d.raw, there, d.step + 1, 1)
         length = jnp.where(d.active, d.step + 2, d.length)
@@ -248,7 +250,7 @@ def _descend(
         step=jnp.zeros((), jnp.int32),
         here=start,
         active=jnp.ones(len(start), bool),
-        around=surroundings(padded, start),
+        around=_surroundings(padded, start, margin),
         cost=padded,
         raw=raw,
         length=jnp.ones(len(start), jnp.int32),

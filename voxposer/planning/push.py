@@ -150,14 +150,21 @@ def best_push(
         raise ValueError(f"points and target must be [B, M, 3] and [B, 3], got {points.shape} and {target.shape}")
     slots = len(points)
     low, high = (_heights(limit, default, slots) for limit, default in ((lowest, -jnp.inf), (highest, jnp.inf)))
-    usable = jnp.isfinite(points).all(-1)
-    usable = usable if valid is None else usable & valid
+    usable, free = _usable_and_free(points, valid, touchable)
     points = jnp.where(usable[..., None], points, 0)
-    free = usable if touchable is None else usable & jnp.asarray(touchable, bool)
-    free = jnp.where(free.any(-1, keepdims=True), free, usable)
     search = jax.vmap(partial(_search, config=config), in_axes=(0, 0, 0, None if normals is None else 0, 0, 0, 0, 0))
     normals = None if normals is None else jnp.asarray(normals)
     return search(points, usable, free, normals, target, _keys(key, slots), low, high)
+
+
+def _usable_and_free(
+    points: Num[Array, "B M 3"], valid: Bool[AnyArray, "B M"] | None, touchable: Shaped[AnyArray, "B M"] | None
+) -> tuple[Bool[Array, "B M"], Bool[Array, "B M"]]:
+    """Points that count, and those of them that the hand can come to: all where there are none, bool [B, M] each."""
+    usable = jnp.isfinite(points).all(-1)
+    usable = usable if valid is None else usable & valid
+    free = usable if touchable is None else usable & jnp.asarray(touchable, bool)
+    return usable, jnp.where(free.any(-1, keepdims=True), free, usable)
 
 
 def push_costs(
