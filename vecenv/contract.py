@@ -419,6 +419,19 @@ class Metrics:
 
 
 @dataclass(frozen=True)
+class Timings:
+    """Where an environment's time went since it was made, seconds of wall clock.
+
+    Attributes:
+        physics_s: stepping and resetting.
+        images_s: rendering images.
+    """
+
+    physics_s: float = 0.0
+    images_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class State:
     """Physics state of every slot.
 
@@ -467,6 +480,11 @@ class BatchEnv(Protocol):
         """Which slots have finished their episode, bool [B]; the others are live, or wait for ``reset``."""
         ...
 
+    @property
+    def timings(self) -> Timings:
+        """Seconds spent so far in physics and in rendering images."""
+        ...
+
     def instructions(self) -> tuple[str, ...]:
         """What each slot's policy is told at present; some SIMPLER tasks have two instructions in turn."""
         ...
@@ -487,12 +505,12 @@ class BatchEnv(Protocol):
         """Follow a plan, waypoints [B, T]."""
         ...
 
-    def observe_egocentric(self) -> Egocentric:
-        """Cameras and proprioception."""
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
+        """Cameras and proprioception; images of some slots only, where ``slots`` says which."""
         ...
 
-    def observe_objects(self, points: str = "surface") -> Objects:
-        """Ground truth."""
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
+        """Ground truth; of some slots only, where ``slots`` says which."""
         ...
 
     def evaluate(self) -> Metrics:
@@ -511,8 +529,8 @@ class BatchEnv(Protocol):
         """While inside, ``watcher`` is called before every tick of an episode."""
         ...
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
-        """Choose what each slot runs next, then call ``reset``."""
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None, slots: Any = None) -> None:
+        """Choose what each slot runs next, or some slots while the others continue; then call ``reset``."""
         ...
 
     def close(self) -> None:
