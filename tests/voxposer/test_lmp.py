@@ -521,7 +521,9 @@ def test_an_error_deep_down_is_told_as_the_innermost_programs_with_the_way_to_it
 @pytest.mark.parametrize("text", ["Sure! I would love to help.", "The bowl is on the table:\n- grasp it", "x = (1"])
 def test_an_answer_that_is_no_program_is_told_with_lmp_and_model(setup: Callable[..., Setup], text: str) -> None:
     robot = setup({("get_gripper_map", "go"): text})
-    with pytest.raises(LmpError, match=r"get_gripper_map\('go'\): .*openai/local wrote what cannot be run") as caught:
+    with pytest.raises(
+        LmpError, match=r"get_gripper_map\('go'\): .*openai/local wrote a program that cannot be run"
+    ) as caught:
         robot.lmps.get_gripper_map("go")
     assert caught.value.rule == "syntax"
     assert repr(text.splitlines()[0]) in caught.value.reason
@@ -554,7 +556,7 @@ def test_a_provider_that_refuses_is_nobodys_program(setup: Callable[..., Setup])
     robot = setup({("composer", "go"): "get_gripper_map('open')", ("get_gripper_map", "open"): failure(401, "bad key")})
     with pytest.raises(LlmError, match="bad key") as caught:
         robot.lmps.composer("go")
-    assert caught.value.__notes__ == ["asked by get_gripper_map('open')", "in composer('go')"]
+    assert caught.value.__notes__ == ["requested by get_gripper_map('open')", "in composer('go')"]
     assert "bad key" in (call_of(robot.lmps, "get_gripper_map").error or "")
 
 

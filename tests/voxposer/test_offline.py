@@ -349,16 +349,16 @@ def test_directions_are_x_to_the_front_y_to_the_right_z_up(query: str, point: tu
 @pytest.mark.parametrize(
     ("instruction", "complaint"),
     [
-        ("sing a song", "no verb"),
+        ("sing a song", "no known verb"),
         ("put the teapot on the plate", "'the teapot' fits none of mug_1, mug_2, plate_1"),
         ("put the mug on the plate", "'the mug' could be any of mug_1, mug_2"),
-        ("put the left mug", "where to put"),
-        ("put it on the plate", "what is to be put"),
-        ("put the left mug between the plate", "'between' needs two things"),
+        ("put the left mug", "the destination of"),
+        ("put it on the plate", "the object to put there is missing"),
+        ("put the left mug between the plate", "'between' needs two objects"),
         ("open the plate", "no handle to the plate"),
         ("turn on the plate", "no knob to the plate"),
         ("put the left mug next to the teapot", "the teapot"),
-        ("", "no verb"),
+        ("", "no known verb"),
     ],
 )
 def test_the_planner_says_what_it_does_not_understand(instruction: str, complaint: str) -> None:

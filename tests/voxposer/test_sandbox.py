@@ -163,7 +163,7 @@ def test_a_fault_of_the_host_passes_unchanged() -> None:
 
 
 def test_a_function_that_returns_what_no_program_may_hold_is_named() -> None:
-    with pytest.raises(SandboxError, match="module is no kind of value") as caught:
+    with pytest.raises(SandboxError, match="module is not a kind of value") as caught:
         parse("x = leak()").run({"leak": lambda: np})
     assert caught.value.rule == "values"
 

@@ -126,7 +126,7 @@ class Llm:
         if kept is not None:
             self._count(Usage(cached=1))
             return kept
-        reply = self._asked(request)
+        reply = self._with_retries(request)
         if check is not None:
             check(reply.text)
         self._keep(key, request, reply)
@@ -178,7 +178,7 @@ class Llm:
 
     # The question
 
-    def _asked(self, request: Mapping[str, Any]) -> Reply:
+    def _with_retries(self, request: Mapping[str, Any]) -> Reply:
         response = self._answered(request)
         reply = self._reply(response, request["stop"])
         self._count(

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from voxposer.offline.grammar import Action, Noun, Place, Relation, read_instruction, read_noun, side_said
+from voxposer.offline.grammar import Action, Noun, Place, Relation, read_instruction, read_noun, split_side
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 
 # Distances spoken of in subtasks, centimetres: over a target before the last descent; before a target that is entered
@@ -52,7 +52,7 @@ def ground(noun: Noun, names: Sequence[Name]) -> Found:
     Raises:
         NotUnderstood: no name fits, or several do and the noun does not say which.
     """
-    words, side = side_said(noun.words)
+    words, side = split_side(noun.words)
     for option in (noun, replace(noun, words=words, side=side) if side and not noun.side else noun):
         found = matching(option.words, names)
         if found:

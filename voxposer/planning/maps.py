@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Num, Shaped
+from jaxtyping import Array, Bool, Float, Integer, Num, Shaped
 
 AnyArray = Array | np.ndarray
 
@@ -106,7 +106,7 @@ def voxelize(
     return grid.reshape(*points.shape[:-2], size, size, size)
 
 
-def squared_distance(occupied: Bool[Array, "*batch N M K"]) -> Int[Array, "*batch N M K"]:
+def squared_distance(occupied: Bool[Array, "*batch N M K"]) -> Integer[Array, "*batch N M K"]:
     """Squared distance in voxels from every voxel to the nearest occupied one, exactly.
 
     One min-plus product per axis (Felzenszwalb and Huttenlocher's decomposition without its envelope: at these sizes
