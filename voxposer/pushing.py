@@ -265,8 +265,8 @@ def _fits(
 ) -> np.ndarray:
     """Whether pushes of an object at ``contacts`` [M, 3] along ``ahead`` [M, 3] have room, bool [M].
 
-    ``start`` is the distance before the contact at which the hand starts, and its slant. The whole hand needs room there;
-    on the way to the contact its fingers need room, the pushed object ignored.
+    ``start`` is the distance before the contact at which the hand starts, and its slant. The whole hand needs room
+    there; on the way to the contact its fingers need room, the pushed object ignored.
     """
     distance, slant = start
     begin = _raised(contacts - distance * ahead, lowest)

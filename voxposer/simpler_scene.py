@@ -226,7 +226,7 @@ class HandView:
 
 
 def view(snapshot: ObjectsSnapshot) -> ObjectsSnapshot:
-    """A snapshot of ``simpler/bridge`` with the pose of the hand, distances of its pads, and names from instructions."""
+    """A snapshot of ``simpler/bridge`` with the pose of the hand, distances of its pads and spoken names."""
     left, right = np.maximum(snapshot.gripper - PAD_OFFSET, 0.0)
     return replace(
         snapshot,

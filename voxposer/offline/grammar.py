@@ -400,7 +400,7 @@ class _Reader:
 
 
 def split_side(words: Sequence[str]) -> tuple[tuple[str, ...], str | None]:
-    """Words without the one that selects among equal objects, and that word: ("middle", "bowl") -> ("bowl",), "middle"."""
+    """Words without the one that selects among equals, and that word: ("middle", "bowl") -> ("bowl",), "middle"."""
     for word in words:
         if word in SIDES and len(words) > 1:
             return tuple(other for other in words if other != word), _SAME_SIDE.get(word, word)
