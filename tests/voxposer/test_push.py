@@ -143,6 +143,7 @@ def test_with_a_key_a_slot_a_push_does_not_depend_on_the_batch() -> None:
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[0], b[i], atol=1e-6), alone, together)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_input_that_does_not_fit_is_named() -> None:
     with pytest.raises(ValueError, match=r"must be \[B, M, 3\] and \[B, 3\]"):
         best_push(plate(), target()[None], KEY)

@@ -299,6 +299,7 @@ def test_an_empty_batch_has_no_paths() -> None:
     assert [x.shape for x in traced] == [x.shape for x in paths]
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_shapes_that_do_not_fit_are_named() -> None:
     start, grid, moved = np.zeros((2, 3)), np.zeros((2, SMALL, SMALL, SMALL)), np.zeros(2, bool)
     with pytest.raises(ValueError, match="start must have shape"):

@@ -120,8 +120,8 @@ def best_push(
     valid: Bool[AnyArray, "B M"] | None = None,
     normals: Num[AnyArray, "B M 3"] | None = None,
     touchable: Shaped[AnyArray, "B M"] | None = None,
-    lowest: Num[AnyArray, " B"] | float | None = None,
-    highest: Num[AnyArray, " B"] | float | None = None,
+    lowest: Num[AnyArray, " B"] | Num[AnyArray, ""] | float | None = None,
+    highest: Num[AnyArray, " B"] | Num[AnyArray, ""] | float | None = None,
 ) -> Push:
     """The push that is predicted to bring each thing's centre closest to its target.
 
@@ -307,7 +307,7 @@ def _unit(vectors: Float[Array, "*B 3"]) -> Float[Array, "*B 3"]:
     return jnp.where(length > _NO_WAY, vectors / jnp.where(length > _NO_WAY, length, 1), 0)
 
 
-def _heights(limit: Num[AnyArray, " B"] | float | None, default: float, slots: int) -> jax.Array:
+def _heights(limit: Num[AnyArray, " B"] | Num[AnyArray, ""] | float | None, default: float, slots: int) -> jax.Array:
     return jnp.broadcast_to(jnp.asarray(default if limit is None else limit, jnp.float32), (slots,))
 
 
