@@ -153,7 +153,7 @@ class Interface:
             gripper_map: 1 open, 0 closed, [N, N, N].
 
         Raises:
-            InterfaceError: a map of another shape, an affordance map without targets, or a thing to move without any.
+            InterfaceError: a map of another shape, an affordance map without targets, or an object to push without one.
         """
         seen = _now(movable)
         name = str(seen["name"])

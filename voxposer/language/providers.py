@@ -33,7 +33,7 @@ _CLASSES = re.compile(r"^(litellm\.)?(\w+Error: |Timeout: |Timeout Error: )*(\w+
 
 @functools.cache
 def litellm() -> Any:
-    """litellm, told to leave the network, ``.env`` files and the terminal alone.
+    """litellm, configured not to use the network, ``.env`` files or the terminal.
 
     Raises:
         MissingDependency: it is not installed.

@@ -63,7 +63,7 @@ class Noun:
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """A destination: ``relation`` on, in, top_of, under, near, left_of, right_of, front_of, back_of a thing."""
+    """A destination: ``relation`` on, in, top_of, under, near, left_of, right_of, front_of, back_of an object."""
 
     relation: str
     thing: Noun

@@ -115,7 +115,7 @@ def _lmp(text: str) -> str:
     for call, lmp in _SIGNATURES:
         if call in text:
             return lmp
-    raise NotUnderstood("nothing in the request tells which LMP the program is for")
+    raise NotUnderstood("the request does not show which LMP it is for")
 
 
 def _objects(text: str) -> list[str]:

@@ -8,7 +8,7 @@ NumPy and SciPy's would, which takes float64, SciPy's order of summation and Num
 
 ``optimize_paths`` is one jitted function for any device, and may be traced into a larger one, if that is compiled with
 float64 enabled (JAX cannot lower float64 within a float32 function). Called with concrete arrays on a CPU it does the
-descent in ``planner_numba``, which finds the same voxels several times quicker.
+descent in ``planner_numba``, which finds the same voxels several times faster.
 """
 
 from __future__ import annotations
@@ -407,7 +407,7 @@ def _every(path: Float[Array, "L 3"], length: Int[Array, ""], k: int) -> tuple[F
 def _last(path: Float[Array, "B L 3"], length: Int[Array, " B"]) -> Float[Array, "B 3"]:
     """Where each path ends, [B, 3], the nearest billionth of a voxel.
 
-    The window is a few samples of whole numbers, so a smoothed path does end half-way between voxels, give or take the
-    rounding of whatever fitted the polynomial. Upstream leaves the choice to that rounding.
+    The window is a few samples of whole numbers, so a smoothed path does end half-way between voxels, up to the
+    rounding of the fit. Upstream leaves the choice to that rounding.
     """
     return jnp.round(path[jnp.arange(len(path)), length - 1], 9)

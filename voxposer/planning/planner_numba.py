@@ -4,9 +4,9 @@ In: NumPy arrays, B slots. Out: raw paths, lengths and faults, and the targets t
 of ``planner``'s JAX functions and of SciPy: distances are exact, and each sum is taken in the same order, without
 fast-math and fused multiplication.
 
-Quicker than XLA's loops for three reasons. A blur goes through the volume plane by plane, which stays in a core's
-cache. Rows in which nothing is occupied are skipped, exactly, since they would add zero. And each core works on a slot
-of its own.
+Faster than XLA's loops for three reasons. A blur goes through the volume plane by plane, which stays in a core's
+cache. Rows in which nothing is occupied are skipped, exactly, since they would add zero. And each core works on
+a different slot.
 """
 
 from __future__ import annotations

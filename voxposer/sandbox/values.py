@@ -29,7 +29,7 @@ from voxposer.sandbox.guard import (
 
 # Numbers in one piece of text.
 _PRINTED = 1000
-# Digits that round() may be asked for.
+# Largest number of digits for round().
 _DIGITS = 20
 # Bytes counted for an item put into a list.
 APPENDED_BYTES = 16
@@ -100,7 +100,7 @@ def integer(value: object) -> int:
 
 
 def count_of(value: object) -> int:
-    """A number of things that is asked for."""
+    """A requested count, at least 0."""
     return max(integer(value), 0)
 
 
@@ -126,7 +126,7 @@ def require_power(guard: Guard, base: object, exponent: object) -> None:
 
 
 def truth(guard: Guard, value: object) -> bool:
-    """What ``if value:`` goes by.
+    """The truth value of ``if value:``.
 
     Raises:
         Refusal: it is an array of several elements.
@@ -200,7 +200,7 @@ def text(guard: Guard, value: object, spec: str = "") -> str:
 
 
 def _plain(guard: Guard, value: object) -> Any:
-    """A value whose ``str`` says no more than a program may know, and the same each time."""
+    """A value whose ``str`` reveals no more than a program may know, and is the same each time."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, (list, tuple)):
