@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from vecenv_eval.drive import drive
 from vecenv_eval.policies import extras_of, make_policy
 
 import vecenv
-from vecenv.contract import ObjectsSnapshot
+from vecenv.contract import BatchEnv, ObjectsSnapshot
 from vecenv.manipulation.routes import RouteConfig
 from voxposer.agent import Agent, AgentConfig
 from voxposer.interface import Interface
@@ -250,7 +250,7 @@ REPLIES = {
 
 def agent(env: Obedient, words: tuple[str, ...], **options: Any) -> tuple[Agent, Scripted]:
     llm = Scripted(dict(sorted(REPLIES.items(), key=lambda item: -len(item[0]))))
-    return Agent(env, words, llm, AgentConfig(passes=1, **options)), llm
+    return Agent(cast(BatchEnv, env), words, llm, AgentConfig(passes=1, **options)), llm
 
 
 def test_each_subtask_is_planned_on_the_present_state() -> None:
@@ -276,7 +276,7 @@ def test_a_slot_whose_program_fails_does_not_stop_the_others() -> None:
 def test_an_unsolved_instruction_is_planned_again_up_to_the_pass_limit() -> None:
     env = Obedient(snapshot(CUBE), budget=400)
     llm = Scripted(dict(sorted(REPLIES.items(), key=lambda item: -len(item[0]))))
-    acting = Agent(env, ("lift",), llm, AgentConfig(passes=2))
+    acting = Agent(cast(BatchEnv, env), ("lift",), llm, AgentConfig(passes=2))
     control = acting.step()
     while not control.done.all():
         control = acting.step()
@@ -302,7 +302,7 @@ def test_the_policy_reports_what_an_episode_took() -> None:
     env = Obedient(snapshot(CUBE), budget=300)
     acting, _ = agent(env, ("lift",))
     policy.agent = acting  # pyright: ignore[reportAttributeAccessIssue]
-    list(drive(env, policy))
+    list(drive(cast(BatchEnv, env), policy))
     said = extras_of(policy, 0)
     assert said["subtasks"] == 2
     assert said["llm_calls"] == len(acting.slots[0].lmps.trace) > 3
@@ -403,7 +403,7 @@ def test_a_batch_ends_as_its_episodes_do_one_at_a_time() -> None:
         env = vecenv.make("libero_object", task=0, episodes=episodes)
         policy = make_policy("voxposer")
         policy.reset(env, env.reset())
-        for _ in drive(env, policy):
+        for _ in drive(cast(BatchEnv, env), policy):
             pass
         found = env.evaluate()
         env.close()
@@ -419,6 +419,6 @@ def test_pushing_language_moves_the_plate_by_pushes() -> None:
     env = vecenv.make("libero_goal", task=5, episodes=[0])
     policy = make_policy("voxposer")
     policy.reset(env, env.reset())
-    for _ in drive(env, policy):
+    for _ in drive(cast(BatchEnv, env), policy):
         pass
     assert env.evaluate().success.all()

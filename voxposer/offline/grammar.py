@@ -56,9 +56,8 @@ class Noun:
         """The phrase in words, which this grammar parses to the same noun."""
         article = "any" if self.indefinite else "the"
         side = f" {_SIDE_WORDS[self.side]}" if self.side else ""
-        return f"{article} {' '.join(self.words)}{side}" + (
-            f" {_relation_text(self.relation)}" if self.relation else ""
-        )
+        relation = f" {_relation_text(self.relation)}" if self.relation else ""
+        return f"{article} {' '.join(self.words)}{side}{relation}"
 
 
 @dataclass(frozen=True, kw_only=True)
