@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -176,7 +176,7 @@ def _round_to_float32(x: jax.Array) -> jax.Array:
 
 
 @_round_to_float32.defjvp
-def _round_to_float32_jvp(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+def _round_to_float32_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
     return _round_to_float32(*primals), tangents[0]
 
 

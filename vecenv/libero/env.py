@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
@@ -74,7 +74,7 @@ class LiberoEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def set_some_episodes(self, slots: Any, episodes: Any) -> None:
+    def set_some_episodes(self, slots: npt.ArrayLike, episodes: npt.ArrayLike) -> None:
         """Choose what some slots run next, of the task they have; ``reset`` begins it, and the others go on.
 
         Args:
@@ -90,7 +90,7 @@ class LiberoEnv(SlotBatch):
         self._placement = self._chosen(None, chosen)
         self._live[slots] = False
 
-    def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
+    def _chosen(self, tasks: object, episodes: object) -> placing.Placement:
         counts = {"num_tasks": len(self._sources), "num_episodes": NUM_EPISODES}
         indices = None if tasks is None else placing.task_indices(tasks, [source.name for source in self._sources])
         return placing.each(indices, episodes, self._placement, **counts)
@@ -186,7 +186,7 @@ class LiberoEnv(SlotBatch):
 
     # -- stepping ------------------------------------------------------------------------------------------------------
 
-    def step_continuous(self, actions: Any) -> Control:
+    def step_continuous(self, actions: npt.ArrayLike) -> Control:
         """Advance by one control tick, or by a chunk of K.
 
         Args:
@@ -342,7 +342,14 @@ class LiberoEnv(SlotBatch):
             qpos[slots, : model.nq], qvel[slots, : model.nv] = group.qpos, group.qvel
         return State(qpos=qpos, qvel=qvel, time=time, nq=nq, nv=nv)
 
-    def set_state(self, state: State | None = None, *, qpos: Any = None, qvel: Any = None, time: Any = None) -> None:
+    def set_state(
+        self,
+        state: State | None = None,
+        *,
+        qpos: npt.ArrayLike | None = None,
+        qvel: npt.ArrayLike | None = None,
+        time: npt.ArrayLike | None = None,
+    ) -> None:
         """Overwrite the physics state of every slot; step counts, verdicts and the controller's memory stay.
 
         Args:

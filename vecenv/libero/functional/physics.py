@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 from mujoco import mjx
 
 from vecenv.controllers import gripper as gripper_control
@@ -82,7 +82,7 @@ class WorldPhysics:
     def _sized(self, function: Callable[..., Data]) -> Callable[..., Data]:
         return Sized(function, lambda num_worlds: self._blank(num_worlds)())
 
-    def _alone(self, function: Callable[..., Data], *args: Any) -> Data:
+    def _alone(self, function: Callable[..., Data], *args: PyTree) -> Data:
         return function(self._blank(1)(), *args)
 
     def _blank(self, num_worlds: int) -> Callable[[], mjx.Data]:

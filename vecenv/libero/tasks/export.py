@@ -321,7 +321,7 @@ class ExportFolder:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ExportError(f"{path}: damaged: not the index of an export; {self._again}") from error
 
-    def _check_versions(self, layout: Any, version: Any) -> None:
+    def _check_versions(self, layout: object, version: object) -> None:
         if version != mujoco.__version__:
             raise ExportError(
                 f"{self.path}: exported with MuJoCo {version}, running {mujoco.__version__}: "

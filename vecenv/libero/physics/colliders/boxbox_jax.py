@@ -8,11 +8,12 @@ metres apart. What single precision asks for is said in ``vecenv.libero.physics.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mujoco import mjx
 
 MOST = 8
 # Distance of a row without a contact, metres.
@@ -47,6 +48,12 @@ class Box(NamedTuple):
     size: jax.Array
 
 
+class PairKey(Protocol):
+    """What MJX says of a group of geom pairs: ``data_ids``, the mesh of each of the two geoms, -1 for other geoms."""
+
+    data_ids: tuple[int, int]
+
+
 class _Found(NamedTuple):
     """Candidates in a frame: positions [24, 3], depths [24], and which of them count."""
 
@@ -55,7 +62,7 @@ class _Found(NamedTuple):
     valid: jax.Array
 
 
-def collider(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def collider(model: mjx.Model, data: mjx.Data, key: PairKey, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """A collision function of MJX: distances [8 N], positions [8 N, 3], frames [8 N, 3, 3] of pairs of geoms [N, 2]."""
     first, second = (Box(data.geom_xpos[g], data.geom_xmat[g], model.geom_size[g]) for g in geom.T)
     margin = model.geom_margin[geom].sum(-1)

@@ -69,7 +69,7 @@ def _without_mesh_margins(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _is_marked(model: Any) -> bool:
+def _is_marked(model: mujoco.MjModel | mjx.Model) -> bool:
     """Whether the first custom number of a model, MuJoCo's or MJX's, is the mark."""
     return len(model.numeric_data) > 0 and float(model.numeric_data[0]) == MARK
 
@@ -81,7 +81,7 @@ def _unsupported(found: str) -> MjxContactsError:
     )
 
 
-def _expect(function: Any, arguments: str, *names: str) -> types.FunctionType:
+def _expect(function: object, arguments: str, *names: str) -> types.FunctionType:
     """The undecorated function, checked to take these arguments first and to refer to these global names.
 
     Raises:
@@ -99,7 +99,7 @@ def _expect(function: Any, arguments: str, *names: str) -> types.FunctionType:
     return plain
 
 
-def _copy_with(function: types.FunctionType, name: str, **replaced: Any) -> types.FunctionType:
+def _copy_with(function: types.FunctionType, name: str, **replaced: object) -> types.FunctionType:
     """A copy of a function in which some of its global names have other values."""
     copied = types.FunctionType(function.__code__, {**function.__globals__, **replaced}, name, function.__defaults__)
     copied.__annotations__, copied.__doc__ = dict(function.__annotations__), function.__doc__
@@ -111,7 +111,7 @@ def _dispatch(published: Callable[..., Any], current: Callable[..., Any], is_mar
     """A function of a model that calls ``published`` if the model is marked, else ``current``."""
 
     @functools.wraps(current)
-    def chosen(model: Any, *args: Any, **kwargs: Any) -> Any:
+    def chosen(model: object, *args: object, **kwargs: object) -> Any:
         return (published if is_marked(model) else current)(model, *args, **kwargs)
 
     return chosen
@@ -146,7 +146,7 @@ def _warp_driver() -> Any:
         raise _unsupported(str(error)) from error
 
 
-def _has_bit(model: Any) -> bool:
+def _has_bit(model: mjx.Model) -> bool:
     """Whether a model of MuJoCo Warp, or an MJX model for it, has the mark of published contacts."""
     return bool(int(model.opt.disableflags) & PUBLISHED)
 
