@@ -74,7 +74,7 @@ class LiberoEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def set_some_episodes(self, slots: npt.ArrayLike, episodes: npt.ArrayLike) -> None:
+    def set_some_episodes(self, slots: Sequence[int] | np.ndarray, episodes: npt.ArrayLike) -> None:
         """Choose what some slots run next, of the task they have; ``reset`` begins it, and the others go on.
 
         Args:

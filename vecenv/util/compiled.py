@@ -17,12 +17,12 @@ from numba import types
 from numba.core import cgutils
 from numba.core.base import BaseContext
 from numba.core.types import IntegerLiteral, Type
-from numba.core.typing import Context as TypingContext
+from numba.core.typing.context import Context as TypingContext
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 # What an intrinsic returns: its signature, and the function that generates its code.
-Intrinsic: TypeAlias = tuple[Signature, Callable[..., ir.Value]]
+Intrinsic: TypeAlias = tuple[Signature, Callable[..., Any]]
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
 # What only compiled code calls needs no entry from Python or C, which is a quarter less to compile. Called from Python
@@ -61,9 +61,7 @@ def stack_array(typingctx: TypingContext, size: Type) -> Intrinsic:
         raise TypeError("stack_array: the size must be a literal")
     count = size.literal_value
 
-    def codegen(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]
-    ) -> ir.Value:
+    def codegen(context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]) -> Any:
         kind = ir.ArrayType(ir.DoubleType(), count)
         return builder.bitcast(cgutils.alloca_once(builder, kind), ir.DoubleType().as_pointer())
 
@@ -104,19 +102,15 @@ def int32s_at(typingctx: TypingContext, address: Type) -> Intrinsic:
     return types.CPointer(types.int32)(types.uintp), _pointer(ir.IntType(32))
 
 
-def _pointer(kind: ir.Type) -> Callable[..., ir.Value]:
-    def codegen(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]
-    ) -> ir.Value:
+def _pointer(kind: ir.Type) -> Callable[..., Any]:
+    def codegen(context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]) -> Any:
         return builder.inttoptr(args[0], kind.as_pointer())
 
     return codegen
 
 
-def _loader(kind: ir.Type) -> Callable[..., ir.Value]:
-    def codegen(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]
-    ) -> ir.Value:
+def _loader(kind: ir.Type) -> Callable[..., Any]:
+    def codegen(context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]) -> Any:
         return builder.load(builder.inttoptr(args[0], kind.as_pointer()))
 
     return codegen

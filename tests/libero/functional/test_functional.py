@@ -182,6 +182,7 @@ def test_success_ends_the_episode_and_pays_one(plain: Compiled, state: Functiona
     assert after.reward[1] > 1
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_a_batch_of_actions_for_one_world_is_refused(plain: Compiled, state: FunctionalState) -> None:
     with pytest.raises(FunctionalError, match=r"jax\.vmap"):
         plain.env.step(jax.tree.map(lambda x: x[0], state), jnp.zeros((WORLDS, 7)))

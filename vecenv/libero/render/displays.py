@@ -94,7 +94,7 @@ class _Context:
             self._egl.eglReleaseThread()
         self._context = None
 
-    def _current(self, context: ctypes.c_void_p) -> Any:
+    def _current(self, context: ctypes.c_void_p | None) -> Any:
         nothing = self._egl.EGL_NO_SURFACE
         return self._egl.eglMakeCurrent(self._display, nothing, nothing, context)
 

@@ -26,7 +26,7 @@ from numba import types
 from numba.core import cgutils
 from numba.core.base import BaseContext
 from numba.core.types import Type
-from numba.core.typing import Context as TypingContext
+from numba.core.typing.context import Context as TypingContext
 from numba.core.typing.templates import Signature
 
 from vecenv.errors import SimulationError
@@ -212,9 +212,7 @@ def _compiled() -> tuple[Any, Any]:
 def _layout(typingctx: TypingContext, index: Type) -> Intrinsic:
     """An entry of ``_LAYOUT``."""
 
-    def codegen(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]
-    ) -> ir.Value:
+    def codegen(context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]) -> Any:
         kind = ir.IntType(64)
         variable = builder.module.globals.get(_SYMBOL) or ir.GlobalVariable(builder.module, kind, _SYMBOL)
         variable.linkage = "external"
@@ -227,9 +225,7 @@ def _layout(typingctx: TypingContext, index: Type) -> Intrinsic:
 def _call(typingctx: TypingContext, function: Type, arguments: Type) -> Intrinsic:
     """Call a C function that returns an int32 by its address, with a tuple of arguments."""
 
-    def codegen(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]
-    ) -> ir.Value:
+    def codegen(context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]) -> Any:
         values = cgutils.unpack_tuple(builder, args[1])
         kind = ir.FunctionType(ir.IntType(32), [value.type for value in values])
         return builder.call(builder.inttoptr(args[0], kind.as_pointer()), values)

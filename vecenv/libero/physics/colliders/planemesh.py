@@ -77,7 +77,7 @@ def _collide(
 
 
 @part
-def _lowest(hull: np.ndarray, count: int, points: np.ndarray, down: np.ndarray) -> int:
+def _lowest(hull: np.ndarray, count: int, points: np.ndarray, down: np.ndarray) -> Any:
     """Number of the hull's vertex furthest along a direction, reached from the first along its edges."""
     best, height, climbing = 0, _along(points, hull[2 + count], down), True
     while climbing:
