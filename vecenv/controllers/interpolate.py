@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -156,6 +156,7 @@ class Planner:
             return False
 
 
+@runtime_checkable
 class _Phases(Protocol):
     """Consecutive phases of one dof, as ``ruckig`` gives them: durations, and the values at their beginnings."""
 
@@ -164,13 +165,20 @@ class _Phases(Protocol):
     v: Sequence[float]
     a: Sequence[float]
     j: Sequence[float]
+
+
+@runtime_checkable
+class _Brake(_Phases, Protocol):
+    """The braking phases, which are all unused if their ``duration`` is 0."""
+
     duration: float
 
 
+@runtime_checkable
 class _DofProfile(_Phases, Protocol):
     """The path of one dof: seven phases, and the braking phases before them."""
 
-    brake: _Phases
+    brake: _Brake
 
 
 def _phases(profile: _DofProfile) -> list[list[float]]:
