@@ -28,7 +28,7 @@ def stage(fence: bool, function: Callable[..., Any], *args: PyTree) -> PyTree:
     """Apply ``function`` to arrays; with ``fence``, as a call that XLA compiles on its own.
 
     XLA's CPU fusion copies a cheap producer into each of its consumers, and along a chain of eliminations that repeats
-    the first steps thousands of times. ``optimization_barrier`` is gone before fusion runs; a call that may not be
+    the first steps thousands of times. ``optimization_barrier`` is removed before fusion runs; a call that may not be
     inlined stays. The controller's torques of 512 slots take 0.5 ms instead of 2, and compiling them 1 s instead of 5.
     """
     if not fence:

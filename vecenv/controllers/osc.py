@@ -119,8 +119,8 @@ def set_goal(
     """Set the goal from a policy action, as ``OperationalSpaceController.set_goal`` does once per control tick.
 
     The goal is relative to where the arm *is*, not to the previous goal. The orientation goal is kept when all three
-    rotation components are exactly 0 (robosuite compares with zero absolute tolerance), so an arm told not to rotate
-    returns to its last commanded orientation.
+    rotation components are exactly 0 (robosuite compares with zero absolute tolerance), so an arm whose action
+    does not rotate returns to its last commanded orientation.
 
     Args:
         arm: current arm; only ``eef_pos`` and ``eef_mat`` are read.
@@ -146,7 +146,7 @@ def set_goal(
 def _robosuite_rotation(rotvec: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
     """Rotation matrix of a rotation vector with robosuite's rounding (``quat2mat(axisangle2quat(v))``).
 
-    ``quat2mat`` works in float32 whatever it is given, which moves a goal by up to 1e-7 rad. The same roundings are
+    ``quat2mat`` computes in float32 for any input, which moves a goal by up to 1e-7 rad. The same roundings are
     made here, in the order compiled robosuite makes them, so float64 goals agree to the last bits.
     """
     angle = safe_norm(rotvec)[..., None]

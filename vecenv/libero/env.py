@@ -58,7 +58,7 @@ class LiberoEnv(SlotBatch):
         config: options.
 
     Raises:
-        LiberoError, SceneError, GoalError, FixtureError, TaskDataError: something the options ask for does not exist.
+        LiberoError, SceneError, GoalError, FixtureError, TaskDataError: an option names something that does not exist.
     """
 
     _error = LiberoError
@@ -75,11 +75,11 @@ class LiberoEnv(SlotBatch):
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
     def set_some_episodes(self, slots: Sequence[int] | np.ndarray, episodes: npt.ArrayLike) -> None:
-        """Choose what some slots run next, of the task they have; ``reset`` begins it, and the others go on.
+        """Choose the next episodes of some slots, without changing their tasks; the next ``reset`` begins them.
 
         Args:
-            slots: their indices, or bool [B].
-            episodes: init state of each of them, or one for all.
+            slots: their indices, or bool [B]; the other slots are not affected.
+            episodes: the init state of each of these slots, or one for all.
 
         Raises:
             PlacementError: an episode that does not exist.
@@ -96,7 +96,7 @@ class LiberoEnv(SlotBatch):
         return placing.each(indices, episodes, self._placement, **counts)
 
     def _prepare(self) -> np.ndarray:
-        """Scenes, physics and goal tables for the current placement; what still fits is kept."""
+        """Scenes, physics and goal tables for the current placement; physics that still fits is reused."""
         indices = np.unique(self._placement.task)
         problems = {int(i): self._sources[i].problem() for i in indices}
         keys = list(dict.fromkeys(problem.scene_key() for problem in problems.values()))
@@ -130,7 +130,7 @@ class LiberoEnv(SlotBatch):
         return self._sources[min(sharing)].scene(goals.contact_pairs(sharing.values()), lean_for, self.config.contacts)
 
     def _exact_scene(self, group: Group) -> Scene:
-        """A group's scene with upstream's collision geoms, whatever its physics has."""
+        """A group's scene with upstream's collision geoms, also when its physics uses lean ones."""
         if self.config.geometry == "exact":
             return group.scene
         problems = {i: task.problem for i, task in self._tasks.items()}
@@ -255,7 +255,9 @@ class LiberoEnv(SlotBatch):
         )
 
     def set_visuals(self, options: VisualOptions | Sequence[VisualOptions]) -> None:
-        """Change how slots look from now on: light, viewpoints, colours, textures. Physics does not notice.
+        """Change the appearance of slots from the next observation on: light, viewpoints, colours, textures.
+
+        Physics is unaffected.
 
         Args:
             options: one for all slots, or B of them; ``VisualOptions()`` is upstream's look.
@@ -269,7 +271,7 @@ class LiberoEnv(SlotBatch):
     def observe_objects(self, points: str = "surface") -> Objects:
         """Ground truth of every slot.
 
-        Parts are those of upstream's collision geometry with lean geometry, too.
+        Parts are those of upstream's collision geometry, also with lean geometry.
 
         Args:
             points: ``"surface"``, true surface points of the collision geometry (at least 200 a thing, always the same
@@ -353,7 +355,7 @@ class LiberoEnv(SlotBatch):
         """Overwrite the physics state of every slot; step counts, verdicts and the controller's memory stay.
 
         Args:
-            state: what ``state()`` returned; or the arrays one by one, what is None stays:
+            state: what ``state()`` returned; or the arrays one by one, of which None leaves the present values:
             qpos: [B, >= nq]. qvel: [B, >= nv]. time: seconds, [B].
 
         Raises:

@@ -1,9 +1,9 @@
 """Compiling functions with numba: one cache policy and one set of options for all compiled code.
 
 Everything is float64 without fast-math, so bits depend neither on the batch nor on the machine's vectors. A function is
-compiled once a machine and read from numba's cache afterwards: beside the function's file, else in the user's cache
-folder, else not at all. Numba looks for changes in the file of the compiled function alone, so keep the functions it
-calls (``part``) in the same file.
+compiled once per machine and then read from numba's cache, which is next to the function's file, or in the user's cache
+folder if that cannot be written; if neither can, nothing is cached. Numba looks for changes in the file of the compiled
+function alone, so keep the functions it calls (``part``) in the same file.
 """
 
 from __future__ import annotations

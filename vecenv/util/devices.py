@@ -2,7 +2,7 @@
 
 In: arrays sharded by their first axis, or replicated. Out: arrays sharded likewise. Devices exchange nothing, so a loop
 ends on a device when its own rows have stopped. Every device has its own executable and its own thread: XLA's
-partitioner does not survive Warp's calls (segmentation fault in the compiler; jax 0.11.2, warp-lang 1.18.0), and a
+partitioner crashes on Warp's calls (segmentation fault in the compiler; jax 0.11.2, warp-lang 1.18.0), and a
 thread that waits for a loop's condition on one device must not keep the other devices waiting.
 """
 

@@ -95,7 +95,7 @@ class _Row:
 
 
 def contact_pairs(problems: Iterable[Problem]) -> tuple[tuple[str, str], ...]:
-    """The pairs of things whose contacts these tasks' goals ask for, each pair and the whole sorted by name."""
+    """The pairs of things whose contacts these tasks' goals test, each pair and the whole sorted by name."""
     return tuple(sorted({pair for problem in problems for pair in _contact_pairs(problem)}))
 
 

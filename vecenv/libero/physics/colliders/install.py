@@ -1,4 +1,4 @@
-"""Published contacts inside MuJoCo: our colliders in its collision table, for models that ask for them.
+"""Published contacts inside MuJoCo: our colliders in its collision table, used for models with the mark.
 
 MuJoCo calls the collider of two geoms through a table of function pointers, ``mjCOLLISIONFUNC``. The table belongs to
 the whole process, so its entries for two boxes and for a mesh on a plane become functions that look at the model first:
@@ -257,7 +257,7 @@ def _box_box(model: int, data: int, rows: int, geom1: int, geom2: int, margin: f
 
 
 def _plane_mesh(model: int, data: int, rows: int, geom1: int, geom2: int, margin: float) -> int:
-    """MuJoCo's collider of a mesh on a plane, likewise."""
+    """MuJoCo's collider of a mesh on a plane: writes contacts to ``rows`` and returns how many."""
     mesh = int32_at(_row(model, _GEOM_DATAID, geom2, 4))
     graph = int32_at(_row(model, _GRAPHADR, mesh, 4)) if mesh >= 0 else -1
     if graph < 0 or not _is_marked(model):

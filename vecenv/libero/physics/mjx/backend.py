@@ -1,7 +1,7 @@
 """The MJX backend: a batch of worlds behind the interface of ``vecenv.libero.physics.base``.
 
 In: scenes made ready (``Build``), which scene each slot runs, start states, goals, and actions or plans. Out: the state
-of every slot as NumPy arrays, fetched from the device when asked for. Chunks of actions and plans of waypoints run in
+of every slot as NumPy arrays, fetched from the device on access. Chunks of actions and plans of waypoints run in
 one compiled call a scene.
 """
 
@@ -31,7 +31,7 @@ from vecenv.util.devices import replicated
 
 
 class MjxGroup:
-    """The slots of one scene on the device; NumPy copies are fetched when asked for."""
+    """The slots of one scene on the device; NumPy copies are fetched on access."""
 
     def __init__(self, built: Build, slots: np.ndarray, mesh: Mesh | None) -> None:
         self.scene, self.slots, self.built = built.scene, slots, built

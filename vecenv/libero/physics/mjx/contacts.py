@@ -1,4 +1,4 @@
-"""Published contacts inside MJX: our colliders among those of MJX and MuJoCo Warp, for models that ask for them.
+"""Published contacts inside MJX: our colliders among those of MJX and MuJoCo Warp, used for models with the mark.
 
 MJX finds the collider of two geoms in a table, as MuJoCo does. The tables and functions of MJX's private modules
 (``private``) stay as they are. Marked models run copies of the functions, which read a table with our colliders
@@ -29,7 +29,7 @@ from vecenv.libero.physics.colliders import boxbox_jax, planemesh_jax
 from vecenv.libero.physics.private import jax_collision_driver
 from vecenv.libero.scene.contacts import MARK, MESH_MARGIN
 
-# The bit of a Warp model's disable flags that asks for published contacts.
+# The bit of a Warp model's disable flags that selects published contacts.
 PUBLISHED = 1 << 30
 # MuJoCo Warp sends boxes to its table of primitive colliders only where this flag is set; it means nothing else there.
 _BOXES_ARE_PRIMITIVE = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
@@ -41,7 +41,7 @@ class MjxContactsError(SimulationError):
 
 
 def put_model(model: mujoco.MjModel, *, impl: str) -> mjx.Model:
-    """``mjx.put_model`` with the contacts that the model's custom number asks for, see
+    """``mjx.put_model`` with the contacts that the model's custom number selects, see
     ``vecenv.libero.scene.contacts``.
 
     Args:
@@ -49,7 +49,7 @@ def put_model(model: mujoco.MjModel, *, impl: str) -> mjx.Model:
         impl: ``"jax"`` or ``"warp"``.
 
     Raises:
-        MjxContactsError: the model asks for published contacts, and the installed MJX is not a supported one.
+        MjxContactsError: the model needs published contacts, and the installed MJX is not a supported one.
     """
     if not _is_marked(model):
         return mjx.put_model(model, impl=impl)

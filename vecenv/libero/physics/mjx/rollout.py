@@ -113,7 +113,7 @@ def follow_plan(
         plan: T waypoints a world.
         active: worlds that take part, bool [n].
         limit: control steps each world may still take, int [n].
-        max_misses: waypoints in a row that may run out of ticks before a world gives up.
+        max_misses: waypoints in a row that may time out before a world stops.
         sites: ids of the grip site and the hand body.
         config: tolerances and speeds.
         traced: ticks to record.
