@@ -10,6 +10,7 @@ import pytest
 from support import upstream
 
 from vecenv import make
+from vecenv.libero.env import LiberoEnv
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.lean import detail, fits, geometry, recipes
 from vecenv.libero.scene.lean import solids as shapes
@@ -406,6 +407,7 @@ def test_things_stay_where_they_are_while_nobody_touches_them() -> None:
     moved = []
     for profile in geometry.PROFILES:
         env = make("libero_goal", tasks=[0, 6], episodes=[0, 1], geometry=profile)
+        assert isinstance(env, LiberoEnv)
         env.reset()
         group = env.physics.groups[0]
         bodies = [group.scene.model.body(entity.root_body).id for entity in group.scene.objects]

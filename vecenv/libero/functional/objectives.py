@@ -262,7 +262,7 @@ def _axes(view: View, body: int) -> Float[Array, "3 3"]:
 
 
 def _centre(view: View, box: Box) -> Float[Array, "3"]:
-    return view.xpos[box.body] + jnp.sum(_axes(view, box.body) * box.centre, axis=-1)
+    return view.xpos[box.body] + jnp.sum(_axes(view, box.body) * box.centre[None], axis=-1)
 
 
 def _distance(view: View, box: Box, point: Float[Array, "3"]) -> Float[Array, ""]:

@@ -171,7 +171,7 @@ class Starts:
         fixed = np.array([thing.entity.fixture for thing in self._things])
         first, second = np.triu_indices(len(fixed), 1)
         matters = ~(fixed[first] & fixed[second])
-        overlap = _overlaps(footprints, layouts, first[matters], second[matters])
+        overlap = jax.vmap(lambda layout: _overlaps(footprints, layout, first[matters], second[matters]))(layouts)
         best = jnp.argmin(jnp.sum(overlap, axis=-1))
         return jax.tree.map(lambda x: x[best], layouts)
 
@@ -293,8 +293,8 @@ def _draw(placement: FixturePlacement, rng: PRNGKeyArray) -> tuple[Float[Array, 
 
 def _overlaps(
     footprints: _Footprints, layout: _Layout, first: Int[np.ndarray, " pairs"], second: Int[np.ndarray, " pairs"]
-) -> Float[Array, "*batch pairs"]:
-    """By how much pairs of things overlap, metres, [..., pairs]; 0 where rectangles or circles lie apart."""
+) -> Float[Array, " pairs"]:
+    """By how much pairs of things overlap, metres, [pairs]; 0 where rectangles or circles lie apart."""
     cos, sin = jnp.cos(layout.yaw), jnp.sin(layout.yaw)
     axes = jnp.stack([jnp.stack([cos, sin], -1), jnp.stack([-sin, cos], -1)], -2)
     middle = layout.spot + jnp.sum(axes * footprints.centre[..., None], axis=-2)
@@ -303,14 +303,14 @@ def _overlaps(
     for owner in (first, second):
         for k in range(2):
             along = axes[..., owner, k, :]
-            reach = sum(_reach(axes[..., i, :, :], footprints.half[i], along) for i in (first, second))
+            reach = sum(_reach(axes[..., i, :, :], jnp.asarray(footprints.half)[i], along) for i in (first, second))
             gaps.append(jnp.abs(jnp.sum(apart * along, -1)) - reach)
     return jnp.maximum(-jnp.max(jnp.stack(gaps), axis=0), 0.0)
 
 
 def _reach(
-    axes: Float[Array, "*batch pairs 2 2"], half: Float[Array, "pairs 2"], along: Float[Array, "*batch pairs 2"]
-) -> Float[Array, "*batch pairs"]:
+    axes: Float[Array, "pairs 2 2"], half: Float[Array, "pairs 2"], along: Float[Array, "pairs 2"]
+) -> Float[Array, " pairs"]:
     """How far rectangles extend from their middles along a direction, metres."""
     return jnp.sum(half * jnp.abs(jnp.sum(axes * along[..., None, :], -1)), -1)
 

@@ -210,7 +210,7 @@ def _gradient(layout: _Layout, problem: _Problem, qacc: jax.Array) -> jax.Array:
 
 
 class _Islands(NamedTuple):
-    """Trees connected by rows: ``first`` [R, ntree], one-hot, a tree of each row; ``mates`` [ntree, ntree], same island."""
+    """Trees connected by rows: ``first`` [R, ntree], one-hot, a tree per row; ``mates`` [ntree, ntree], by island."""
 
     first: jax.Array
     mates: jax.Array

@@ -358,7 +358,7 @@ def _rotated(mat: AnyArray, vector: AnyArray, xp: ModuleType) -> Any:
 def _in_region(pos: AnyArray, frame_pos: AnyArray, frame_mat: AnyArray, size: AnyArray, xp: ModuleType) -> Any:
     """Upstream's ``in_box``: an axis-aligned box around the rotated half extents."""
     extent = xp.abs(_rotated(frame_mat, size, xp))
-    below = xp.array([0.0, 0.0, _BOX_BELOW], dtype=extent.dtype)
+    below = xp.array([[[0.0, 0.0, _BOX_BELOW]]], dtype=extent.dtype)
     return xp.all((pos > frame_pos - extent - below) & (pos < frame_pos + extent), axis=-1)
 
 

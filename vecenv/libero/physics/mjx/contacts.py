@@ -81,7 +81,7 @@ def _unsupported(found: str) -> MjxContactsError:
     )
 
 
-def _expect(function: Callable[..., Any] | None, arguments: str, *names: str) -> types.FunctionType:
+def _expect(function: Any, arguments: str, *names: str) -> types.FunctionType:
     """The undecorated function, checked to take these arguments first and to refer to these global names.
 
     Raises:
