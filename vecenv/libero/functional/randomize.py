@@ -73,7 +73,7 @@ def _varied(model: mjx.Model, rng: PRNGKeyArray, *, config: Randomization) -> di
     mass = factor("mass", (model.nbody,))
     fingers = jnp.where(jnp.arange(model.nu) >= ARM_DOFS, factor("gripper"), 1.0)[:, None]
     return {
-        "geom_friction": model.geom_friction * jnp.stack([factor("friction"), *[jnp.ones(())] * 2]),
+        "geom_friction": model.geom_friction * jnp.stack([factor("friction"), *[jnp.ones(())] * 2])[None],
         "body_mass": model.body_mass * mass,
         "body_inertia": model.body_inertia * mass[:, None],
         "dof_damping": model.dof_damping * factor("damping", (model.nv,)),
