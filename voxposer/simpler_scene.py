@@ -16,22 +16,12 @@ from typing import Any
 import numpy as np
 
 from vecenv.actions import GRIPPER
-from vecenv.contract import (
-    BatchEnv,
-    Control,
-    EePoseControl,
-    Egocentric,
-    Metrics,
-    Objects,
-    ObjectsSnapshot,
-    PlanControl,
-    PointCloud,
-    ResetInfo,
-)
+from vecenv.contract import BatchEnv, Control, EePoseControl, Metrics, PlanControl, ResetInfo
 from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.routes import RouteConfig
 from vecenv.manipulation.world import Margins, matrix
+from vecenv.observations import Egocentric, Objects, ObjectsSnapshot, PointCloud
 from voxposer.agent import AgentConfig
 from voxposer.perception.config import PerceptionConfig
 from voxposer.planning.plan import PlanConfig, SubtaskPlan

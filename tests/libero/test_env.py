@@ -11,10 +11,11 @@ import pytest
 
 import vecenv
 from vecenv.actions import ActionError
-from vecenv.contract import BatchEnv, ImagesUnavailable
+from vecenv.contract import BatchEnv
 from vecenv.libero.env import LiberoEnv, LiberoError
 from vecenv.libero.scene import elements
 from vecenv.libero.tasks import sources
+from vecenv.observations import ImagesUnavailable
 from vecenv.placement import PlacementError
 
 STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])

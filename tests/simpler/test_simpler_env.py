@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from support.simpler_files import GOOGLE_ROLLOUTS, SEEDS, WIDOWX_ROLLOUTS, rollouts
 
-from vecenv.contract import ImagesUnavailable, State
+from vecenv.contract import State
+from vecenv.observations import ImagesUnavailable
 from vecenv.simpler.control.rotations import rotation_from_quat
 from vecenv.simpler.layouts import episode_layout
 from vecenv.simpler.task_spec import BRIDGE, GOOGLE

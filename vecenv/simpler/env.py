@@ -14,15 +14,15 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
-from vecenv.contract import Control, Egocentric, Objects, Rendered, State
+from vecenv.contract import Control, State
 from vecenv.controllers.waypoint import WaypointPlan
+from vecenv.observations import Egocentric, Objects, Rendered
 from vecenv.simpler import snapshot
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.config import SimplerConfig, SimplerError
@@ -37,7 +37,7 @@ from vecenv.simpler.physics.spec import instances
 from vecenv.simpler.published.lists import EpisodeSpec, check_placement, counts, place, scene_of
 from vecenv.simpler.published.lists import episodes as published_episodes
 from vecenv.simpler.tasks import find_task, list_tasks
-from vecenv.simpler.variants import varied
+from vecenv.simpler.variants import make_variant, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
@@ -90,7 +90,7 @@ class SimplerEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
+    def _chosen(self, tasks: object, episodes: object) -> placing.Placement:
         most = max(counts(self.config.protocol, self.suite).values())
         limits = {"num_tasks": len(self.tasks), "num_episodes": most}
         placement = placing.each(task_indices(self.suite, tasks), episodes, self._placement, **limits)
@@ -106,7 +106,7 @@ class SimplerEnv(SlotBatch):
     def _episode(self, task: int, episode: int) -> Episode:
         key = (task, episode)
         if key not in self._prepared:
-            chosen, layout = varied(*scene_of(self._spec(*key)), self.config.variant)
+            chosen, layout = varied(*scene_of(self._spec(*key)), make_variant(self.config.variant))
             made = prepare(chosen, layout, self._root)
             if self.config.variant is not None:
                 require_drawable(made, self._root)
@@ -364,7 +364,7 @@ class SimplerEnv(SlotBatch):
         return np.concatenate([qpos[:dof], qvel[:dof], qpos[dof:joints], qvel[dof:joints], things.ravel()])
 
 
-def task_indices(suite: str, tasks: Any) -> Any:
+def task_indices(suite: str, tasks: object) -> object:
     """Indices of tasks given by name, index, or several of either; None stays None."""
     if tasks is None or isinstance(tasks, Mapping):
         return tasks

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
+from vecenv.observations import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from vecenv.simpler.control.rotations import rotation_from_quat
 from vecenv.simpler.episodes import Episode
 from vecenv.simpler.task_spec import BRIDGE, SimplerTask

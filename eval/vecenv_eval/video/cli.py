@@ -36,9 +36,9 @@ def video_command(
 ) -> None:
     """Record a policy: all episodes of a batch in one mp4, titled, framed by verdict."""
     from vecenv.cli import fail
-    from vecenv.contract import ImagesUnavailable
     from vecenv.libero.render.gl import GlError
     from vecenv.libero.render.options import RenderError
+    from vecenv.observations import ImagesUnavailable
     from vecenv_eval.policies import PolicyError, make_policy
     from vecenv_eval.runner import default_policy
 

@@ -17,9 +17,9 @@ from support import upstream
 from support.images import needs_gl, psnr
 
 import vecenv
-from vecenv.contract import Egocentric
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.render.options import RenderConfig
+from vecenv.observations import Egocentric
 
 pytestmark = needs_gl
 

@@ -128,7 +128,7 @@ def counts(protocol: str, suite: str) -> dict[int, int]:
     return {index: count for index, count in found.items() if count}
 
 
-def place(protocol: str, suite: str, tasks: Any, episodes: Any) -> Placement:
+def place(protocol: str, suite: str, tasks: object, episodes: object) -> Placement:
     """Every chosen episode of every chosen task, task by task.
 
     Args:
