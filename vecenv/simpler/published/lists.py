@@ -40,8 +40,8 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.errors import InvalidInput
 from vecenv.placement import Placement, PlacementError, cross
+from vecenv.protocols import ProtocolError
 from vecenv.simpler.layouts import Choices, Layout, drawn, episode_seed, lay_out, unseeded_seeds
 from vecenv.simpler.published.specs import (
     PROTOCOLS,
@@ -76,8 +76,8 @@ __all__ = [
 ]
 
 
-class PublishedError(InvalidInput):
-    """A protocol that does not exist, or a task that it has no episodes of; the message says what there is."""
+class PublishedError(ProtocolError):
+    """A protocol that does not exist, or a task without episodes under it; the message lists those that exist."""
 
 
 def episodes(protocol: str, task: str) -> Sequence[EpisodeSpec]:
