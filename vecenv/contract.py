@@ -159,6 +159,19 @@ class Metrics:
 
 
 @dataclass(frozen=True)
+class Timings:
+    """Time that an environment has spent since it was made, seconds of wall clock.
+
+    Attributes:
+        physics_s: stepping and resetting.
+        images_s: rendering images.
+    """
+
+    physics_s: float = 0.0
+    images_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class State:
     """Physics state of every slot.
 
@@ -207,6 +220,11 @@ class BatchEnv(Protocol):
         """Slots that have finished their episode, bool [B]; the others are live, or wait for ``reset``."""
         ...
 
+    @property
+    def timings(self) -> Timings:
+        """Seconds spent so far in physics and in rendering images."""
+        ...
+
     def instructions(self) -> tuple[str, ...]:
         """The current instruction of each slot; some SIMPLER tasks have two, one after the other."""
         ...
@@ -229,12 +247,12 @@ class BatchEnv(Protocol):
         """Follow a plan, waypoints [B, T]."""
         ...
 
-    def observe_egocentric(self) -> Egocentric:
-        """Cameras and proprioception."""
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
+        """Cameras and proprioception; images of ``slots`` only (bool [B] or indices), if given."""
         ...
 
-    def observe_objects(self, points: str = "surface") -> Objects:
-        """Ground truth."""
+    def observe_objects(self, points: str = "surface", slots: npt.ArrayLike | None = None) -> Objects:
+        """Ground truth; of ``slots`` only, if given."""
         ...
 
     def evaluate(self) -> Metrics:
@@ -253,8 +271,10 @@ class BatchEnv(Protocol):
         """While inside, ``watcher`` is called before every tick of an episode."""
         ...
 
-    def set_episodes(self, *, tasks: object = None, episodes: object = None) -> None:
-        """Choose what each slot runs next, then call ``reset``."""
+    def set_episodes(
+        self, *, tasks: object = None, episodes: object = None, slots: npt.ArrayLike | None = None
+    ) -> None:
+        """Choose what each slot runs next, or some slots while the others continue; then call ``reset``."""
         ...
 
     def close(self) -> None:

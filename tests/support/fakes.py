@@ -24,13 +24,15 @@ class FakeEnv:
     def __init__(
         self,
         tasks: Sequence[int],
-        episodes: Sequence[int],
+        episodes: Sequence[int] | Mapping[int, Sequence[int]],
         *,
         max_steps: int = 10,
         faults: Mapping[tuple[int, int], str] | None = None,
         raise_in: Mapping[int, BaseException] | None = None,
     ) -> None:
-        self.tasks, self.episodes = [np.array(x) for x in zip(*((t, e) for t in tasks for e in episodes), strict=True)]
+        by_task = episodes if isinstance(episodes, Mapping) else dict.fromkeys(tasks, episodes)
+        pairs = [(task, episode) for task in tasks for episode in by_task[task]]
+        self.tasks, self.episodes = [np.array(column) for column in zip(*pairs, strict=True)]
         self.num_envs = len(self.tasks)
         self.max_steps, self.faults, self.raise_in = max_steps, faults or {}, raise_in or {}
         self.closed, self.placements = False, 1
@@ -51,7 +53,11 @@ class FakeEnv:
             max_steps=np.full(self.num_envs, self.max_steps),
         )
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None, slots: Any = None) -> None:
+        if slots is not None:
+            self.tasks[slots], self.episodes[slots] = tasks, episodes
+            self.ticks[slots], self.terminated[slots], self.truncated[slots] = 0, False, False
+            return
         assert len(tasks) == len(episodes) == self.num_envs
         self.tasks, self.episodes = np.array(tasks), np.array(episodes)
         self.placements += 1
