@@ -109,6 +109,8 @@ def test_protocols_of_another_family_are_refused_with_those_there_are(name: str,
 @pytest.mark.parametrize("name", [None, 3, ["openpi"]])
 def test_what_is_no_name_is_refused(name: Any) -> None:
     with pytest.raises(ProtocolError, match="is not available for libero"):
+        protocol(name)
+    with pytest.raises(vecenv.OptionError, match='field "protocol"'):
         vecenv.make("libero_goal", protocol=name)
 
 
@@ -118,8 +120,9 @@ def test_what_is_no_name_is_refused(name: Any) -> None:
 def test_the_default_protocol_is_what_the_environment_does_by_itself() -> None:
     env = vecenv.make("libero_goal", task=0, episodes=[0])
     assert isinstance(env, LiberoEnv)
-    assert env.config == LiberoConfig()
-    assert env.config.protocol == DEFAULT
+    assert vecenv.make_config("libero_goal", {}) == LiberoConfig()
+    assert env.config.rules("libero_goal") == LiberoConfig().rules("libero_goal")
+    assert env.config.protocol == LiberoConfig().protocol == DEFAULT
     env.close()
 
 

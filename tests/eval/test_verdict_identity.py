@@ -1,8 +1,8 @@
 """A verdict belongs to (task, init state, seed, what the policy replied), and not to the batch around it.
 
 Rows of the results folder, without what says when and how fast they came about, are the same byte for byte at any
-number of slots and threads, in any order of refills, for any split into runs. Each row holds a hash of every state the episode
-went through, so that two trajectories with the same verdict are told apart.
+number of slots and threads, in any order of refills, for any split into runs. Each row holds a hash of every state the
+episode went through, so that two trajectories with the same verdict are told apart.
 """
 
 from __future__ import annotations

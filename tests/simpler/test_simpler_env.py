@@ -83,7 +83,7 @@ def test_missing_stages_are_named(carrot: SimplerEnv) -> None:
 
 def test_no_renderer_torch_or_maniskill_is_loaded(small: Path) -> None:
     program = (
-        "import sys; from vecenv.simpler.env import make\n"
+        "import sys; from vecenv import make\n"
         f"env = make('simpler/bridge', task='{CARROT}', episodes=[0], num_threads=1); env.reset(); env.close()\n"
         "print([name for name in ('torch', 'mani_skill') if name in sys.modules])"
     )

@@ -250,7 +250,7 @@ class SimplerEnv(SlotBatch):
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
-    def observe_egocentric(self, slots: Any = None) -> Egocentric:
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
         """What every slot's camera sees now, and its joints; images are rendered when they are first read.
 
         Args:
@@ -288,7 +288,7 @@ class SimplerEnv(SlotBatch):
     def _images_s(self) -> float:
         return self._drawing_s
 
-    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
+    def observe_objects(self, points: str = "surface", slots: npt.ArrayLike | None = None) -> Objects:
         """Ground truth of every slot.
 
         Args:
