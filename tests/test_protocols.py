@@ -198,7 +198,7 @@ def test_an_evaluation_plans_the_protocols_episodes() -> None:
 )
 def test_simplers_tasks_have_as_many_episodes_as_their_protocol(suite: str, name: str, tasks: str, count: int) -> None:
     evaluation = Evaluation(EvalConfig(suite=suite, protocol=name, policy="zero", tasks=tasks))
-    assert len(evaluation.planned) == sum(map(len, evaluation.batches())) == count
+    assert len(evaluation.planned) == sum(map(len, evaluation.streams())) == count
 
 
 def test_simplers_metadata_counts_task_by_task_and_leaves_out_what_a_protocol_does_not_have() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import typer
 
-from vecenv_eval.video.episodes import LOD, MAX_STEPS, SIZE, make_env, record_rollout
+from vecenv_eval.video import LOD, MAX_STEPS, SIZE
 
 
 def video_command(
@@ -41,6 +41,7 @@ def video_command(
     from vecenv.observations import ImagesUnavailable
     from vecenv_eval.policies import PolicyError, make_policy
     from vecenv_eval.runner import default_policy
+    from vecenv_eval.video.episodes import make_env, record_rollout
 
     options = {"max_steps": max_steps, "size": size, "lod": lod}
     try:
