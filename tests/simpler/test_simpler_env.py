@@ -134,7 +134,7 @@ def test_an_episode_repeats_exactly_whatever_ran_before_or_beside_it(tree: Path,
     alone.close()
 
 
-def test_bad_numbers_are_mended_and_reported(carrot: SimplerEnv) -> None:
+def test_bad_numbers_are_sanitized_and_reported(carrot: SimplerEnv) -> None:
     actions = np.zeros((2, 7))
     actions[1] = [np.nan, np.inf, 0, 0, 0, 2.0, 0]
     assert carrot.step_continuous(actions).info["sanitized"].tolist() == [False, True]
@@ -259,7 +259,7 @@ def test_a_driver_missing_in_workers_is_named_and_physics_goes_on(small: Path, m
 def test_worker_processes_draw_what_one_process_draws(small: Path) -> None:
     if not drawable():
         pytest.skip("no Vulkan driver")
-    pictures = []
+    images = []
     for count in (1, 2):
         env = make(BRIDGE, task=CARROT, episodes=range(3), assets=small, num_threads=count)
         env.reset()
@@ -268,10 +268,10 @@ def test_worker_processes_draw_what_one_process_draws(small: Path) -> None:
         env.step_continuous(np.tile([0.05, 0, 0, 0, 0, 0, 1.0], (3, 1)))
         # Drawn when read, of the moment of the observation; the arrays stay when others are drawn, and after close.
         after = env.observe_egocentric()
-        pictures.append([after.rgb, before.rgb, before.depth, before.segmentation])
+        images.append([after.rgb, before.rgb, before.depth, before.segmentation])
         env.close()
-    (after, before, depth, shown), others = pictures
-    for one, other in zip(pictures[0], others, strict=True):
+    (after, before, depth, shown), others = images
+    for one, other in zip(images[0], others, strict=True):
         np.testing.assert_array_equal(one, other)
     assert (after[0] != before[0]).any()
     assert not any(array[1].any() for array in (before, shown, depth))

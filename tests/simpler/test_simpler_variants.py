@@ -90,7 +90,7 @@ def test_move_near_can_do_without_its_third_object() -> None:
         (OPEN, {"distractors": "less"}, f"distractors='less' is not available for {OPEN}; expected none at all"),
         (NEAR, {"distractors": "more"}, "expected one of none"),
         (COKE, {"camera": "left"}, "camera='left': expected one of lower, higher"),
-        ("widowx_stack_cube", {"lighting": "darker"}, "there are none of widowx_stack_cube"),
+        ("widowx_stack_cube", {"lighting": "darker"}, "widowx_stack_cube has none"),
     ],
 )
 def test_what_does_not_fit_a_task_is_refused(task: str, changes: dict[str, str], says: str) -> None:
@@ -142,7 +142,7 @@ def test_a_variant_whose_file_is_missing_names_the_file(small: Path) -> None:
     )
     with pytest.raises(AssetsMissing, match=r"no data/custom/models/stone.glb, a part of mk_station3.urdf"):
         vecenv.make(GOOGLE, task=OPEN, episodes=[0], assets=small, variant={"station": "mk_station3"})
-    with pytest.raises(VariantError, match="'sun' is none of lighting, camera"):
+    with pytest.raises(VariantError, match="'sun' is not one of lighting, camera"):
         vecenv.make(GOOGLE, task=COKE, episodes=[0], assets=small, variant={"sun": "high"})
 
 

@@ -1,7 +1,7 @@
-"""The SIMPLER environment: layouts, scenes, controllers and success criteria behind the verbs of ``vecenv.contract``.
+"""The SIMPLER environment: layouts, scenes, controllers and success criteria with the interface of ``vecenv.contract``.
 
 A batch of slots, each with one episode of one task of ``simpler/bridge`` (WidowX, 5 Hz) or ``simpler/google_robot``
-(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``control/controllers.py`` for how an action becomes
+(3 Hz). Read ``vecenv/contract.py`` for what the methods promise, ``control/controllers.py`` for how an action becomes
 set-points, ``physics/scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so
 actions of the whole batch become set-points in one call; scenes are stepped one by one, in worker processes.
 
@@ -313,7 +313,7 @@ class SimplerEnv(SlotBatch):
 
     @property
     def stand_ins(self) -> tuple[tuple[str, ...], ...]:
-        """For each slot, notes about missing files and what stands in for them."""
+        """For each slot, notes about missing files and their stand-ins."""
         return tuple(episode.notes for episode in self._episodes)
 
     # -- physics state -------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Ground truth of a SIMPLER slot, as planners read it: ``ObjectsSnapshot`` from an episode and its facts.
+"""Ground truth of a SIMPLER slot for planners: ``ObjectsSnapshot`` from an episode and its facts.
 
 In: an ``Episode`` and a row of ``physics.spec.facts_dtype``. Out: surface samples of every object's collision mesh and
 of the cabinet's boxes, poses, the drawers as parts with their joints, and the task's goal as a predicate. Samples of a
