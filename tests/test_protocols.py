@@ -132,6 +132,7 @@ def test_make_follows_a_protocol(name: str) -> None:
     assert config.protocol == name
     for option, value in chosen.options("libero_goal").items():
         assert getattr(config, option) == value
+    assert isinstance(config.render, RenderConfig)
     assert (config.render.height, config.render.width) == (chosen.image_size, chosen.image_size)
     assert not chosen.departures("libero_goal", vars(config))
 

@@ -50,10 +50,12 @@ def _ints(value: object, what: str) -> list[int]:
         items = list(value) if isinstance(value, Iterable) and not isinstance(value, Mapping) else [value]
     except TypeError:  # an array of no dimension
         items = [value]
+    whole: list[int] = []
     for item in items:
         if isinstance(item, bool) or not isinstance(item, int | np.integer):
             raise PlacementError(f"{what}: {item!r} is not an integer")
-    return [int(item) for item in items]
+        whole.append(int(item))
+    return whole
 
 
 def _check(values: Iterable[int], count: int, what: str) -> None:

@@ -227,6 +227,7 @@ def test_every_task_is_drawn_on_its_photograph(small: Path, suite: str) -> None:
     if not drawable():
         pytest.skip("no Vulkan driver")
     env = make(suite, episodes=[0], assets=small, num_threads=1)
+    assert isinstance(env, SimplerEnv)
     env.reset()
     seen = env.observe_egocentric()
     camera = env.tasks[0].camera
@@ -262,6 +263,7 @@ def test_worker_processes_draw_what_one_process_draws(small: Path) -> None:
     images = []
     for count in (1, 2):
         env = make(BRIDGE, task=CARROT, episodes=range(3), assets=small, num_threads=count)
+        assert isinstance(env, SimplerEnv)
         env.reset()
         env._fault[1] = "bad"
         before = env.observe_egocentric()
@@ -324,6 +326,7 @@ def test_worker_processes_do_what_one_process_does(small: Path) -> None:
 
 def test_a_failing_worker_says_why(small: Path) -> None:
     env = make(BRIDGE, task=CARROT, episodes=range(2), assets=small, num_threads=2)
+    assert isinstance(env, SimplerEnv)
     job = env._job(0)
     robot = dataclasses.replace(job.spec.robot, joints=())
     bad = dataclasses.replace(job, spec=dataclasses.replace(job.spec, robot=robot))

@@ -309,10 +309,13 @@ def test_the_command_pulls_variants_alone(tmp_path: Path) -> None:
 def made(root: Path, protocol: str, task: Any, rows: Any, **options: Any) -> SimplerEnv:
     pytest.importorskip("sapien")
     from vecenv import make
+    from vecenv.simpler import env as simpler_env
 
     tasks = [task] if isinstance(task, str) else task
     suite = TASKS[tasks[0]].suite
-    return make(suite, tasks=tasks, protocol=protocol, episodes=rows, assets=root, num_threads=1, **options)
+    env = make(suite, tasks=tasks, protocol=protocol, episodes=rows, assets=root, num_threads=1, **options)
+    assert isinstance(env, simpler_env.SimplerEnv)
+    return env
 
 
 def batch(root: Path, protocol: str, task: str, rows: Sequence[int]) -> SimplerEnv:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +18,9 @@ PLACE = "google_robot_place_apple_in_closed_top_drawer"
 STAY = np.zeros(7)
 
 
-def batch(root: Path, task: str, episodes: object, **options: object) -> SimplerEnv:
+def batch(root: Path, task: str, episodes: object, **options: Any) -> SimplerEnv:
     env = make(TASKS[task].suite, task=task, episodes=episodes, assets=root, num_threads=1, **options)
+    assert isinstance(env, SimplerEnv)
     env.reset()
     return env
 

@@ -262,7 +262,7 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         facts = self._facts.copy()
         state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
-        healthy = [slot for slot in self.slot_indices(slots).tolist() if not self._fault[slot]]
+        healthy: list[int] = [slot for slot in self.slot_indices(slots).tolist() if not self._fault[slot]]
         images = LazyImages(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
         cameras = [episode.task.camera for episode in self._episodes]
         return SimplerEgocentric(

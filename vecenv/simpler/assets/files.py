@@ -268,7 +268,7 @@ def collision_mesh(model: str, root: Path | None = None) -> Path:
 
 
 def visual_mesh(model: str, root: Path | None = None) -> Resolved:
-    """What is drawn of an object: its textured mesh, or a stand-in.
+    """The rendered mesh of an object: its textured mesh, or a stand-in.
 
     Raises:
         AssetsMissing: the object has not even a collision mesh.
