@@ -21,12 +21,8 @@ from vecenv.contract import (
     BatchEnv,
     Control,
     EePoseControl,
-    Egocentric,
     Metrics,
-    Objects,
-    ObjectsSnapshot,
     PlanControl,
-    PointCloud,
     ResetInfo,
     State,
     Timings,
@@ -36,6 +32,7 @@ from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.routes import RouteConfig
 from vecenv.manipulation.world import Margins, matrix
+from vecenv.observations import Egocentric, Objects, ObjectsSnapshot, PointCloud
 from vecenv.placement import Placement
 from voxposer.agent import AgentConfig
 from voxposer.perception.config import PerceptionConfig

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control
+from vecenv.errors import VecenvError
 from vecenv_eval.policies import Policy
 
 # Calls of a policy in a row that may leave every live slot where it was, before it counts as stuck.
 MAX_IDLE_CALLS = 100
 
 
-class PolicyStuck(RuntimeError):
+class PolicyStuck(VecenvError, RuntimeError):
     """The policy keeps returning without a step being taken in any live slot."""
 
 

@@ -12,10 +12,11 @@ from support.libero_batch import STILL, make, put_target_in_basket, still, wiggl
 
 import vecenv
 from vecenv.actions import ActionError
-from vecenv.contract import BatchEnv, ImagesUnavailable
+from vecenv.contract import BatchEnv
 from vecenv.libero.env import LiberoEnv, LiberoError
 from vecenv.libero.scene import elements
 from vecenv.libero.tasks import sources
+from vecenv.observations import ImagesUnavailable
 from vecenv.placement import PlacementError
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from vecenv_eval.episodes import Suite
 from vecenv_eval.simulator import Simulator
 
-from vecenv.contract import Control, EePoseControl, Egocentric, Metrics, Objects, PlanControl, ResetInfo
+from vecenv.contract import Control, EePoseControl, Metrics, PlanControl, ResetInfo
+from vecenv.observations import Egocentric, Objects
 
 SUITE = "fake_suite"
 

@@ -13,7 +13,8 @@ import numpy as np
 from websockets.sync.server import ServerConnection, serve
 
 from support.fakes import FakeEnv
-from vecenv.contract import Egocentric, State, Watcher
+from vecenv.contract import State, Watcher
+from vecenv.observations import Egocentric
 from vecenv.placement import Placement
 
 SIZE = 64

@@ -7,19 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import (
-    Control,
-    Egocentric,
-    Metrics,
-    Objects,
-    ObjectsSnapshot,
-    Part,
-    PartJoint,
-    PlanControl,
-    PointCloud,
-    RegionBox,
-    ResetInfo,
-)
+from vecenv.contract import Control, Metrics, PlanControl, ResetInfo
+from vecenv.observations import Egocentric, Objects, ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 
 HOME = np.array([0.0, 0.0, 0.4, 0.0, 1.0, 0.0, 0.0])
 

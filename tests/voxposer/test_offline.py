@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.offline_world import ToyWorld
 
-from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud
+from vecenv.observations import ObjectsSnapshot, Part, PartJoint, PointCloud
 from voxposer.language.observations import DynamicObservations
 from voxposer.language.prompts import load_prompts
 from voxposer.offline import provider as offline

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from support.voxposer_world import HOME, box, handle, snapshot, space
 
 import vecenv
-from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from vecenv.libero.env import LiberoEnv
 from vecenv.manipulation.grasps import Gripper, room_around
 from vecenv.manipulation.world import matrix
+from vecenv.observations import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from voxposer.perception.config import HandState
 from voxposer.perception.grid import VoxelGrid
 from voxposer.perception.observation import PerceptionError

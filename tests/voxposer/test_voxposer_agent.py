@@ -15,8 +15,9 @@ from vecenv_eval.drive import drive
 from vecenv_eval.policies import extras_of, make_policy
 
 import vecenv
-from vecenv.contract import BatchEnv, ObjectsSnapshot
+from vecenv.contract import BatchEnv
 from vecenv.manipulation.routes import RouteConfig
+from vecenv.observations import ObjectsSnapshot
 from voxposer.agent import Agent, AgentConfig
 from voxposer.interface import Interface
 from voxposer.language.llm import Llm

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv import protocols
-from vecenv.contract import Control, Egocentric, Objects, State
+from vecenv.contract import Control, State
 from vecenv.controllers import waypoint
 from vecenv.libero import observe, starts
 from vecenv.libero.config import LiberoConfig, LiberoError
@@ -33,6 +33,7 @@ from vecenv.libero.tasks import fixtures as fixture_poses
 from vecenv.libero.tasks.export import exported_tasks
 from vecenv.libero.tasks.sources import Task, installed_tasks
 from vecenv.libero.tasks.suites import NUM_EPISODES
+from vecenv.observations import Egocentric, Objects
 from vecenv.slots import SlotBatch
 
 

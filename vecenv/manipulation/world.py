@@ -1,8 +1,8 @@
 """Geometry of one snapshot for planning: where objects are, how high they are, and rotations of hands.
 
-An :class:`~vecenv.contract.ObjectsSnapshot` comes in; :class:`SceneGeometry` answers the questions of grasping, placing
-and moving (points of objects and of everything else, the ground, the tallest point along a line). Hands are rotation
-matrices whose third column points out of the palm and whose second is the closing direction.
+An :class:`~vecenv.observations.ObjectsSnapshot` comes in; :class:`SceneGeometry` answers the questions of grasping,
+placing and moving (points of objects and of everything else, the ground, the tallest point along a line). Hands are
+rotation matrices whose third column points out of the palm and whose second is the closing direction.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot, RegionBox
 from vecenv.manipulation.grasps import Gripper
+from vecenv.observations import ObjectsSnapshot, RegionBox
 
 # The hand pointing down with the fingers closing along world y, as a Panda starts.
 HOME_ROTATION = np.diag([1.0, -1.0, -1.0])

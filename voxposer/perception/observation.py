@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot
 from vecenv.errors import NotFound
+from vecenv.observations import ObjectsSnapshot
 from voxposer.language.observations import Observation
 
 

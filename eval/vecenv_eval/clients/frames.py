@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.contract import BatchEnv, ImagesUnavailable, Rendered
+from vecenv.contract import BatchEnv
+from vecenv.observations import ImagesUnavailable, Rendered
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ import pytest
 from support.images import needs_gl, psnr
 
 import vecenv
-from vecenv.contract import Egocentric
 from vecenv.libero.functional import FunctionalConfig, FunctionalLibero
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.mjx.options import compiler_options
@@ -35,6 +34,7 @@ from vecenv.libero.render.raytrace import RayTracer, Style, poses, style_of
 from vecenv.libero.render.scenery import Scenery, installed_scenery
 from vecenv.libero.tasks.sources import installed_tasks
 from vecenv.libero.tasks.suites import list_tasks
+from vecenv.observations import Egocentric
 
 pytest.importorskip("warp")
 

@@ -17,10 +17,10 @@ from support import upstream
 from support.images import needs_gl, psnr
 
 import vecenv
-from vecenv.contract import Egocentric
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.render.options import RenderConfig
 from vecenv.libero.tasks.suites import list_tasks
+from vecenv.observations import Egocentric
 
 pytestmark = needs_gl
 
