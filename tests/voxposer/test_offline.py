@@ -491,7 +491,7 @@ def test_litellm_gets_programs_tokens_and_errors(monkeypatch: pytest.MonkeyPatch
     assert (
         litellm.completion(model="offline/libero", messages=messages, max_tokens=3).choices[0].finish_reason == "length"
     )
-    with pytest.raises(litellm.BadRequestError, match="does not understand: no verb"):
+    with pytest.raises(litellm.BadRequestError, match="does not understand: no known verb"):
         litellm.completion(model="offline/libero", messages=asked("planner", "sing", ["mug_1"]))
     with pytest.raises(litellm.NotFoundError, match="only offline/libero"):
         litellm.completion(model="offline/other", messages=messages)

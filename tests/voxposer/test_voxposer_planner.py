@@ -316,6 +316,7 @@ def test_mismatched_shapes_are_reported() -> None:
     "change",
     [{"stop_criteria": "never"}, {"max_steps": 0}, {"savgol_window_size": 0}, {"obstacle_map_gaussian_sigma": -1}],
 )
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_numbers_out_of_range_are_reported(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(change))):
         PlannerConfig(**change)

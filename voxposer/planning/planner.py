@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,8 @@ _KEPT_OF_BEND = 0.9
 _SMALLEST_GRID = 50
 # Slots whose maps are in memory at once, outside a CPU.
 _SLOTS_AT_ONCE = 64
+
+Result = TypeVar("Result")
 
 
 class Paths(NamedTuple):
@@ -146,7 +148,7 @@ def _with_jax(
     return lax.platform_dependent(*arrays, cpu=partial(_in_parts, plan, 1), default=partial(_in_parts, plan, None))
 
 
-def _in_parts(plan: Callable[..., Paths], at_once: int | None, *arrays: jax.Array) -> Paths:
+def _in_parts(plan: Callable[..., Result], at_once: int | None, *arrays: jax.Array) -> Result:
     """Apply ``plan`` to some slots after the other, which bounds the memory."""
     slots = len(arrays[0])
     if not slots:
