@@ -7,6 +7,7 @@ eval`` read both with the functions here, so that a specification means the same
 from __future__ import annotations
 
 import difflib
+import fnmatch
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -68,8 +69,8 @@ def parse_tasks(spec: str, num_tasks: int, names: Sequence[str] = ()) -> tuple[i
     """Read task indices: ``"all"``, or indices, ranges and names such as ``"0,3,5-7,widowx_stack_cube"``.
 
     Args:
-        spec: the text. A name may be a substring that only one name has; case does not matter, and spaces are
-            underscores.
+        spec: the text. A name may be a substring that only one name has, or a pattern with ``*`` for every name that
+            matches; case does not matter, and spaces are underscores.
         num_tasks: number of tasks of the suite.
         names: names of the tasks.
 
@@ -199,7 +200,17 @@ def _parse_indices(spec: str, count: int, what: str, names: Sequence[str] = ()) 
 def _parse_part(part: str, count: int, what: str, names: Sequence[str]) -> Sequence[int]:
     if part in names:
         return (names.index(part),)
+    if names and any(character in part for character in "*?["):
+        return _matching(part, what, names)
     return _parse_range(part, count, what) if _RANGE.fullmatch(part) else (_named(part, what, names),)
+
+
+def _matching(pattern: str, what: str, names: Sequence[str]) -> tuple[int, ...]:
+    """The names that match a pattern with ``*``, ``?`` and ``[...]``."""
+    found = tuple(i for i, name in enumerate(names) if fnmatch.fnmatchcase(_plain(name), _plain(pattern)))
+    if not found:
+        raise SpecError(f"no {what} matches {pattern!r}; there are {', '.join(_some(names))}")
+    return found
 
 
 def _parse_range(part: str, count: int, what: str) -> range:

@@ -7,7 +7,7 @@ which of them is in each slot.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,9 +98,25 @@ def make_arguments(config: EvalConfig) -> dict[str, Any]:
     given: dict[str, Any] = {"max_steps": config.max_steps}
     if family(config.suite) == protocols.LIBERO:  # SIMPLER's episodes depend on their number alone
         given["seed"] = config.seed
+    images = {"height": config.image_size, "width": config.image_size, "lod": config.lod, "colors": config.colors}
+    wanted = {name: value for name, value in images.items() if value is not None}
+    if wanted:
+        if family(config.suite) != protocols.LIBERO:
+            raise ConfigError(
+                f"{config.suite}: image size, level of detail and colors are LIBERO's; SIMPLER's are fixed"
+            )
+        arguments["render"] = {**_render_of(arguments), **wanted}
     if config.protocol != protocols.DEFAULT:
         given["protocol"] = config.protocol
     return {**arguments, **{name: value for name, value in given.items() if value is not None}}
+
+
+def _render_of(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What ``--env-arg render=...`` says, to which the other options are added."""
+    given = arguments.get("render", {})
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"render={given!r}: expected a mapping of RenderConfig's fields")
+    return given
 
 
 def slots_of(info: ResetInfo, expected: Sequence[Episode]) -> list[Episode]:

@@ -75,31 +75,51 @@ class EpisodeLoop:
         self._records = {key: r for key, r in store.records().items() if key in wanted and not r.error}
         self._progress = _ProgressReports(on_progress, len(wanted), self._records)
         self._environments = Environments(simulator, suite, config, self._write_conditions)
+        self._number = self._failures = self._verdicts = 0
         self._refill_share = _SHARE_TO_REFILL.get(config.backend, _GPU_SHARE)
 
-    def run(self, streams: Sequence[Stream]) -> bool:
+    def run(self, streams: Sequence[Stream], plan: Callable[[Collection[Episode]], Sequence[Stream]]) -> bool:
         """Run every stream; True when stopped from the keyboard.
+
+        Episodes that end in an error run again, as often as the config says. When two streams have failed and no
+        episode of this run has a verdict, the rest is not tried.
+
+        Args:
+            streams: what to run.
+            plan: makes streams of the episodes that are to run again.
 
         Raises:
             ConfigError: the environment refuses a setting.
         """
-        self._progress.num_batches = len(streams)
-        queue, number = deque(streams), 0
         try:
-            while queue:
-                stream = queue.popleft()
-                rest = self._run_safely(number, stream)
-                if rest is not None:
-                    if self._config.fail_fast:
-                        break
-                    queue.extendleft([rest] if len(rest) else [])
-                    self._progress.num_batches += bool(len(rest))
-                number += 1
+            queue = deque(streams)
+            for _ in range(1 + self._config.retries):
+                if not self._run_all(queue):
+                    break
+                queue = deque(plan(self._failed))
         except KeyboardInterrupt:
             return True
         finally:
             self._environments.close()
         return False
+
+    def _run_all(self, queue: deque[Stream]) -> bool:
+        """Run streams until none is left; False when to stop for good."""
+        while queue:
+            self._progress.num_batches = self._number + len(queue)
+            rest = self._run_safely(self._number, queue.popleft())
+            self._number += 1
+            if rest is not None:
+                self._failures += 1
+                if self._config.fail_fast or (self._failures > 1 and not self._verdicts):
+                    return False
+                queue.extendleft([rest] if len(rest) else [])
+        return True
+
+    @property
+    def _failed(self) -> frozenset[Episode]:
+        """Episodes that ended in an error."""
+        return frozenset(key for key, record in self._records.items() if record.error)
 
     def _run_safely(self, number: int, stream: Stream) -> Stream | None:
         """Run one stream; an exception is recorded for the episodes it cost, and what had not begun is returned."""
@@ -150,6 +170,7 @@ class EpisodeLoop:
                 metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
                 finish(finished, metrics.success, control.info["fault"])
                 self._write([self._record(number, running, i, metrics, control, clocks) for i in slots])
+                self._verdicts += len(slots)
                 self._tell_policy(running, slots)
             progress.steps, progress.seconds = (
                 before[0] + ended + int(control.step_index.sum()),
@@ -233,7 +254,7 @@ class EpisodeLoop:
                 batch=number,
             )
             for episode in episodes
-            if episode not in self._records
+            if episode not in self._records or self._records[episode].error
         ]
         self._write(failed)
         self._progress.report(number)

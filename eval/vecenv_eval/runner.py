@@ -18,7 +18,7 @@ from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
 from vecenv_eval.loop import EpisodeLoop
-from vecenv_eval.policies import Refillable, make_policy
+from vecenv_eval.policies import Closing, Refillable, make_policy
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.report import markdown, summarise
 from vecenv_eval.results import EvalResult, Progress, begin
@@ -105,11 +105,18 @@ class Evaluation:
             index=len(content["runs"]),
         )
         try:
-            interrupted = loop.run(self.streams(store.done()))
+            interrupted = loop.run(self.streams(store.done()), self._again)
         except ConfigError:
             store.discard()
             raise
+        finally:
+            if isinstance(self.policy, Closing):
+                self.policy.close()
         return self._summarise(store, interrupted, tuple(loop.causes))
+
+    def _again(self, episodes: Collection[Episode]) -> list[Stream]:
+        """Streams of these episodes alone."""
+        return self.streams(done=frozenset(self.planned) - frozenset(episodes))
 
     def _summarise(self, store: ResultStore, interrupted: bool, causes: tuple[str, ...]) -> EvalResult:
         """Write the summary of all records in the folder, and return it with them."""

@@ -115,10 +115,10 @@ class FakeEnv:
         control = self.step_continuous(np.zeros((self.num_envs, 7)))
         return PlanControl(**vars(control), error=("",) * self.num_envs)
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
         return Egocentric(state=np.zeros((self.num_envs, 8), np.float32))
 
-    def observe_objects(self, points: str = "surface") -> Objects:
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
         return Objects(snapshot=(None,) * self.num_envs, error=("a fake has no objects",) * self.num_envs)
 
     def close(self) -> None:

@@ -208,7 +208,7 @@ def pinching(towards: np.ndarray, tilt: float, length: np.ndarray, current: np.n
 
 
 def tilted(towards: np.ndarray, tilt: float, current: np.ndarray) -> np.ndarray:
-    """A hand likewise tilted that closes horizontally, across the way it leads, [3, 3]."""
+    """A hand tilted in the same way that closes horizontally, across ``towards``, [3, 3]."""
     return _leading(towards, tilt, current, upright_closing=False)
 
 

@@ -18,7 +18,7 @@ from voxposer.language.observations import Observation
 
 
 class PerceptionError(NotFound):
-    """No object has this name, or the object does not offer what was asked for."""
+    """No object has this name, or the object does not have the requested field."""
 
 
 class LazyObservation(Observation):
