@@ -1,10 +1,10 @@
-"""Pictures and tables of docs/geometry.md: exact and lean collision geometry on top of each other, and what it changes.
+"""Images and tables of docs/geometry.md: exact and lean collision geometry on top of each other, and what it changes.
 
     MUJOCO_GL=osmesa python scripts/geometry_pictures.py pictures   # docs/geometry/*.png and the table of categories
     python scripts/geometry_pictures.py scenes                      # geoms, pairs and drift of all 32 scenes
     python scripts/geometry_pictures.py policy --episodes 10        # pick_place in closed loop, and replayed
 
-Each run replaces its own part of the page, between two comments that name it. Pictures need a GL that MuJoCo can use
+Each run replaces its own part of the page, between two comments that name it. Images need a GL that MuJoCo can use
 (``egl``, ``osmesa`` or ``glfw``) and Pillow.
 """
 
@@ -49,7 +49,7 @@ _TYPES = {
 }
 # Solids and their colour, RGBA.
 _Group: TypeAlias = tuple[Sequence[Solid], tuple[float, ...]]
-# What the pictures ask of things, so that every part of a recipe is shown once.
+# Contents of the images, so that every part of a recipe is shown once.
 _DRAWERS = {"top": {"filled", "worked"}, "middle": {"worked"}}
 _EVERYTHING = frozenset({"held", "bears", "filled:region", "worked:"})
 _OF_CABINETS = frozenset(f"{what}:{name}_region" for name, asked in _DRAWERS.items() for what in asked)
@@ -231,7 +231,7 @@ def replay(suite: str, episodes: int, actions: np.ndarray) -> np.ndarray:
     return success
 
 
-# -- pictures ----------------------------------------------------------------------------------------------------------
+# -- images ------------------------------------------------------------------------------------------------------------
 
 
 def pictures() -> list[str]:
@@ -307,7 +307,7 @@ def placed(scene: Scene, body: int, solid: Solid) -> Solid:
 
 
 def save(name: str, shapes: Sequence[Sequence[Solid]], azimuth: float = 130.0) -> None:
-    """A picture with one panel a shape: the first alone, the others each with the first over it."""
+    """An image with one panel per shape: the first alone, the others each with the first over it."""
     from PIL import Image
 
     exact, *others = shapes

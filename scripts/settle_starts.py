@@ -1,11 +1,12 @@
 """Recompute the settled starts that ship with vecenv: every stored init state after ten idle ticks under MuJoCo 3.3.0.
 
-Run by `make settled` in a venv of its own, because vecenv itself wants a newer MuJoCo. Since 3.4 MuJoCo resolves
+Run by `make settled` in a separate venv, because vecenv requires a newer MuJoCo. Since 3.4 MuJoCo resolves
 box-box contacts differently and some stored states (a bowl 11 cm above a ramekin) settle elsewhere than they did when
 LIBERO's results were published; states that settled under 3.3.0 stay put when a newer MuJoCo loads them.
 
-The starts are stepped by vecenv's own controller and control step, on a stand-in for `mujoco.batch`, which 3.3.0 lacks.
-`--check N` settles N random starts with upstream's environment as well and reports the largest difference.
+The starts are stepped by vecenv's own controller and control step, on a replacement for `mujoco.batch`, which 3.3.0
+does not have. `--check N` settles N random starts with upstream's environment as well and reports the largest
+difference.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 SETTLE_TICKS = 10
-WANTED = "3.3.0"
+REQUIRED = "3.3.0"
 _ALIASES = {"M": "qM"}
 _THREADS = ThreadPoolExecutor(2)
 
@@ -215,8 +216,8 @@ def main() -> None:
         "--rest", type=Path, metavar="FILE", help="rows of benchmarks/premises.py: which starts move here"
     )
     arguments = parser.parse_args()
-    if mujoco.__version__ != WANTED:
-        raise SystemExit(f"this needs mujoco {WANTED}, found {mujoco.__version__}; run `make settled`")
+    if mujoco.__version__ != REQUIRED:
+        raise SystemExit(f"this needs mujoco {REQUIRED}, found {mujoco.__version__}; run `make settled`")
     sys.path.insert(0, str(ROOT))
     install_stand_in()
     from vecenv.libero.tasks import settled, suites

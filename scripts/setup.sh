@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Make a virtual environment if there is none, and install this clone in it, editable, with one extra.
+# Make a virtual environment if it does not exist, and install this clone in it, editable, with one extra.
 # Usage: [PYTHON=python3.11] scripts/setup.sh VENV EXTRA
 set -euo pipefail
 venv=$1 extra=$2

@@ -2,9 +2,9 @@
 ``manifest_variants.json``, those that only variant aggregation opens.
 
 In: an asset tree in the layout of ManiSkill2_real2sim, and a clone of that repository. Every file of the tree is
-listed, and must have the content that the repository's commit has at that path. What the tasks open but the tree lacks
-(some meshes, and the textures beside them) is read from the clone; where the clone is partial and lacks it too, Git's
-identifier of the content is recorded alone, which still verifies a download.
+listed, and must have the content that the repository's commit has at that path. Files that the tasks open but the tree
+does not have (some meshes, and the textures beside them) are read from the clone; if a partial clone does not have one
+either, Git's identifier of the content is recorded alone, which still verifies a download.
 
     python scripts/simpler_manifest.py TREE --git CLONE [--commit COMMIT]
 """
@@ -119,7 +119,7 @@ def _content(options: argparse.Namespace, path: str, blob: str) -> bytes | None:
 
 
 def _git(clone: Path, *arguments: str) -> bytes | None:
-    """What git prints; None where it fails. A partial clone is not to fetch what it lacks."""
+    """The output of git; None if it fails. A partial clone must not fetch missing objects."""
     command = ["git", "-C", str(clone), *arguments]
     done = subprocess.run(command, check=False, capture_output=True, env={**os.environ, "GIT_NO_LAZY_FETCH": "1"})
     return done.stdout if done.returncode == 0 else None

@@ -51,7 +51,7 @@ PREPACKAGED = {
     "google_robot_place_in_closed_bottom_drawer": ("PlaceIntoClosedBottomDrawerCustomInScene-v0", 2),
 }
 AT_MOST = 7
-# Their tables are unlike any that stands in, so nothing is dropped on them.
+# Their tables differ from every stand-in, so nothing is dropped on them.
 UNKNOWN_TABLES = ("Baked_sc1", "alt_background")
 # Name -> offset of the scene, height of the top, lower and upper xy; metres.
 TABLES = {
@@ -224,7 +224,7 @@ def signed(quat: Any) -> list[float]:
 
 
 class _Begun(Exception):
-    """Carries the environment out of upstream's loop when it is about to take its first picture."""
+    """Carries the environment out of upstream's loop before it renders its first image."""
 
 
 class Starts:
@@ -247,7 +247,7 @@ class Starts:
         peer.scenes.CustomSceneEnv._settle = watched
 
     def build(self, name: str, **given: Any) -> Any:
-        """An environment without pictures."""
+        """An environment without images."""
         for pictures in ("camera_cfgs", "rgb_overlay_path", "shader_dir"):
             given.pop(pictures, None)
         return self._peer.gym.make(name, **{**given, "obs_mode": "state_dict"})
@@ -259,7 +259,7 @@ class Starts:
                 self._run(**given)
             except _Begun as begun:
                 return self.read(begun.args[0].unwrapped)
-        raise RuntimeError("the loop took no picture")
+        raise RuntimeError("the loop rendered no image")
 
     def resets(self, name: str, count: int) -> list[dict[str, Any]]:
         """Of resets in a row."""

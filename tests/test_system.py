@@ -106,7 +106,7 @@ def test_make_test_and_make_eval_bring_what_the_release_has(machine: Machine) ->
         "install -y --no-install-recommends libosmesa6",
         "install -y --no-install-recommends libvulkan1",
     ]
-    assert "lack system libraries: mesa-vulkan-drivers (Mesa 24.3 or newer)" in done.stdout
+    assert "missing system libraries for images: mesa-vulkan-drivers (Mesa 24.3 or newer)" in done.stdout
 
 
 def test_without_root_they_only_say_what_is_missing(machine: Machine) -> None:

@@ -17,17 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vecenv.actions import GRIPPER
-from vecenv.contract import (
-    BatchEnv,
-    Control,
-    EePoseControl,
-    Metrics,
-    PlanControl,
-    ResetInfo,
-    State,
-    Timings,
-    Watcher,
-)
+from vecenv.contract import BatchEnv, Control, EePoseControl, Metrics, PlanControl, ResetInfo, State, Timings, Watcher
 from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.routes import RouteConfig

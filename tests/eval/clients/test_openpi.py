@@ -18,7 +18,7 @@ from vecenv_eval.runner import EvalConfig, Simulator, begin, evaluate
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection
 
-from vecenv.contract import ImagesUnavailable
+from vecenv.observations import ImagesUnavailable
 
 
 def answer_all(host: WebSocketHost, connection: ServerConnection, number: int) -> None:
