@@ -277,7 +277,7 @@ def test_gradients_are_finite_and_equal_finite_differences_moving_and_at_rest(ch
         qpos, qvel = states[..., :9], states[..., 9:]
         parts = (*arm_state(chain, qpos, qvel), *hand_pose(chain, qpos))
         flat = jnp.concatenate([part.reshape(len(states), -1) for part in parts], axis=1)
-        values = jnp.sum(flat * np.arange(1, flat.shape[1] + 1), axis=1)
+        values = jnp.sum(flat * np.arange(1, flat.shape[1] + 1)[None], axis=1)
         return jnp.sum(values), values
 
     shifted = states[:, None, None] + step * np.stack([directions, -directions])
