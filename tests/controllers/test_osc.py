@@ -208,8 +208,9 @@ def test_gradients_equal_finite_differences(cases: Cases) -> None:
     @partial(jax.grad, has_aux=True)
     def slopes_and_values(inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Of a number for each slot that depends on all of its torques."""
-        moving = arm._replace(qvel=inputs[..., 6:])
-        torque = osc.torques(moving, osc.set_goal(moving, goal, inputs[..., :6], loose), cases.home, loose)
+        still, aim = jax.tree.map(lambda x: x[None], (arm, goal))
+        moving = still._replace(qvel=inputs[..., 6:])
+        torque = osc.torques(moving, osc.set_goal(moving, aim, inputs[..., :6], loose), cases.home, loose)
         values = jnp.sum(torque**2, axis=-1)
         return jnp.sum(values), values
 
