@@ -156,7 +156,7 @@ def test_every_tick_of_a_batch_is_a_frame_and_the_last_shows_the_verdicts(tmp_pa
 
 @pytest.mark.parametrize("option", [{"size": 64}, {"lod": "fast"}])
 def test_simplers_images_have_one_size_and_detail(option: dict[str, Any]) -> None:
-    from vecenv_eval.video.episodes import make_env
+    from vecenv_eval.video.rollout import make_env
 
     with pytest.raises(ValueError, match=f"--{next(iter(option))}"):
         make_env("simpler/bridge", "0", 1, option)
@@ -166,7 +166,7 @@ def test_a_simpler_video_runs_at_its_robots_rate(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     pytest.importorskip("PIL")
     import imageio
-    from vecenv_eval.video.episodes import record_rollout
+    from vecenv_eval.video.rollout import record_rollout
 
     env: Any = Countdown()
     env.robot = SimpleNamespace(control_hz=5)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import typer
 
-from vecenv_eval.video.episodes import LOD, MAX_STEPS, SIZE, make_env, record_rollout
+from vecenv_eval.video.rollout import LOD, MAX_STEPS, SIZE, make_env, record_rollout
 
 
 def video_command(
