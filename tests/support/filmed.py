@@ -54,7 +54,9 @@ class FilmedEnv:
         self.shades[moved] += 10
 
 
-def record(episode: int = 0, success: bool = True, *, suite: str = "libero_goal", steps: int = 3, **more: str) -> Record:
+def record(
+    episode: int = 0, success: bool = True, *, suite: str = "libero_goal", steps: int = 3, **more: str
+) -> Record:
     """How an episode went."""
     return Record(
         suite=suite,

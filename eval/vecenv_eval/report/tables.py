@@ -1,7 +1,7 @@
-"""A summary as tables: on the screen, in Markdown, LaTeX and CSV.
+"""A summary as a table, on the screen and in Markdown.
 
-A :class:`~vecenv_eval.report.summary.Summary` comes in and text goes out; LaTeX and CSV take several summaries, one a
-suite and run, so that they hold what a paper's table holds.
+A :class:`~vecenv_eval.report.summary.Summary` comes in and a table goes out: what ``vecenv eval`` prints and writes.
+``run_tables`` writes whole runs, of several suites, for ``vecenv report``.
 """
 
 from __future__ import annotations
