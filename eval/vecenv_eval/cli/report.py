@@ -1,12 +1,13 @@
 """``vecenv report``: a results folder as a page, or as a table to paste.
 
-A results folder comes in, or a folder of them (one a suite), and perhaps a second one to compare with; an HTML page goes
-out, or Markdown, LaTeX or CSV. The exit status is 2 when a folder cannot be read or the arguments are wrong.
+A results folder comes in, or a folder of them (one a suite), and perhaps a second one to compare with; an HTML page
+goes out, or Markdown, LaTeX or CSV. The exit status is 2 when a folder cannot be
+read or the arguments are wrong, and 1 when a package is missing.
 """
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 
 import typer
@@ -14,7 +15,7 @@ import typer
 from vecenv.cli import fail
 
 
-class Format(str, Enum):
+class Format(StrEnum):
     """What to write."""
 
     html = "html"
@@ -35,6 +36,7 @@ def report_command(
     ),
 ) -> None:
     """Report on an evaluation: success with intervals, failures first, conditions; or compare two."""
+    from vecenv.errors import MissingDependency
     from vecenv_eval.report.compare import compare
     from vecenv_eval.report.run import read_run
     from vecenv_eval.report.run_tables import latex, markdown, to_csv
@@ -48,7 +50,10 @@ def report_command(
         from vecenv_eval.report.html import page
 
         out = out or folder / "report.html"
-        text = page(*runs, out=out, embed_mb=embed_mb)
+        try:
+            text = page(*runs, out=out, embed_mb=embed_mb)
+        except MissingDependency as error:
+            fail(str(error), code=1)
     elif format is Format.markdown:
         text = markdown(runs, compare(*runs) if other else None)
     else:

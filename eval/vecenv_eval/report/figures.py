@@ -1,7 +1,7 @@
 """The charts of a report, as plain plotly figures: ``{"data": [...], "layout": {...}}``.
 
-One or two :class:`~vecenv_eval.report.run.Run` come in. Colours of text, axes and background are left to the page, which
-knows whether it is light or dark.
+One or two :class:`~vecenv_eval.report.run.Run` come in. Colours of text, axes and background are left to the page,
+which knows whether it is light or dark.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from vecenv.errors import MissingDependency
 from vecenv_eval.report import figures
 from vecenv_eval.report.compare import compare
 from vecenv_eval.report.findings import conditions, last_actions, plain, video_of, warnings
@@ -58,10 +59,16 @@ def page(run: Run, other: Run | None = None, *, out: Path, embed_mb: float = EMB
         run, other: the runs.
         out: where the page will be written; linked videos are relative to it.
         embed_mb: most megabytes of videos inside the page.
+
+    Raises:
+        MissingDependency: jinja2 or plotly is not installed.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-    from plotly.offline import get_plotlyjs
+    try:
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined
+        from markupsafe import Markup
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise MissingDependency(f"the page needs {error.name}: pip install 'vecenv[eval]'") from None
 
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
