@@ -71,7 +71,7 @@ class Comparison:
         one, two = self.rates
         return (
             f"On {self.episodes} episodes that both have a verdict about, {self.first} solved {one:.1%} and "
-            f"{self.second} {two:.1%} ({two - one:+.1%}). {len(self.lost)} went from solved to failed, "
+            f"{self.second} {two:.1%} ({100 * (two - one):+.1f} points). {len(self.lost)} went from solved to failed, "
             f"{len(self.won)} from failed to solved; McNemar's exact test: p = {self.p_value:.2g}."
         )
 

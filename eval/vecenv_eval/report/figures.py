@@ -15,8 +15,8 @@ import numpy as np
 from vecenv_eval.report.run import Run, SuiteRun
 
 Figure: TypeAlias = dict[str, Any]
-# Readable on white and on black, and told apart by those who see few colours (Okabe and Ito).
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+# Readable on white and on black, and told apart by those who see few colours (after Okabe and Ito).
+COLORS = ("#2a8fd8", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 # Where the seconds of an episode go, by field of a record.
 PARTS = {"policy_s": "policy", "physics_s": "physics", "images_s": "images"}
 _ROW, _HEAD = 24, 90
@@ -34,6 +34,7 @@ def success_by_task(suite: SuiteRun, other: SuiteRun | None = None, names: Seque
             {
                 "type": "scatter",
                 "mode": "markers",
+                "orientation": "h",
                 "name": escape(names[index]),
                 "x": (100 * rates).tolist(),
                 "y": [f"task {row.task}" for row in rows],
@@ -52,7 +53,7 @@ def success_by_task(suite: SuiteRun, other: SuiteRun | None = None, names: Seque
     layout = _layout(_HEAD + _ROW * tasks * len(data), "success, %")
     layout["xaxis"]["range"] = [-2, 102]
     layout["yaxis"] = {"autorange": "reversed", "automargin": True, "type": "category"}
-    return {"data": data, "layout": layout | {"showlegend": len(data) > 1}}
+    return {"data": data, "layout": layout | {"showlegend": len(data) > 1, "scattermode": "group", "scattergap": 0.4}}
 
 
 def success_over_ticks(runs: Sequence[Run]) -> Figure:
