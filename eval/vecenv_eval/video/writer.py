@@ -60,6 +60,7 @@ class VideoWriter:
 
     Attributes:
         frames: how many were written.
+        height, width: of the file's frames, pixels; 0 before the first.
 
     Raises:
         RenderError: the path does not end in .mp4.
@@ -69,7 +70,7 @@ class VideoWriter:
         self.path = Path(path)
         if self.path.suffix != ".mp4":
             raise RenderError(f"{self.path}: videos are written as .mp4")
-        self.frames = 0
+        self.frames, self.height, self.width = 0, 0, 0
         self._fps, self._keyframes = Fraction(fps).limit_denominator(1000), keyframes
         self._open: tuple[OutputContainer, VideoStream] | None = None
 
@@ -83,6 +84,7 @@ class VideoWriter:
         padded = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
         if self._open is None:
             self._open = self._start(padded)
+            self.height, self.width = padded.shape[:2]
         from av import VideoFrame
 
         container, stream = self._open
