@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 from vecenv_eval.store import Record
@@ -55,7 +56,7 @@ class FilmedEnv:
 
 
 def record(
-    episode: int = 0, success: bool = True, *, suite: str = "libero_goal", steps: int = 3, **more: str
+    episode: int = 0, success: bool = True, *, suite: str = "libero_goal", steps: int = 3, **more: Any
 ) -> Record:
     """How an episode went."""
     return Record(

@@ -24,36 +24,39 @@ _ROW, _HEAD = 24, 90
 
 def success_by_task(suite: SuiteRun, other: SuiteRun | None = None, names: Sequence[str] = ("", "")) -> Figure:
     """Success rate of each task with its interval; with those of the same suite in another run beside it."""
-    data = []
-    for index, each in enumerate((suite, other)):
-        if each is None:
-            continue
-        rows = [row for row in each.summary.tasks if row.rate is not None]
-        rates = np.array([row.rate for row in rows], float)
-        data.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "orientation": "h",
-                "name": escape(names[index]),
-                "x": (100 * rates).tolist(),
-                "y": [f"task {row.task}" for row in rows],
-                "error_x": {
-                    "type": "data",
-                    "symmetric": False,
-                    "array": [100 * (row.high - row.rate) for row in rows],  # pyright: ignore[reportOptionalOperand]
-                    "arrayminus": [100 * (row.rate - row.low) for row in rows],  # pyright: ignore[reportOptionalOperand]
-                },
-                "marker": {"size": 9, "color": COLORS[index], "symbol": ("circle", "diamond")[index]},
-                "text": [f"{escape(row.instruction)}<br>{row.successes}/{row.episodes}" for row in rows],
-                "hovertemplate": "%{text}<br>%{x:.1f} %<extra></extra>",
-            }
-        )
+    data = [
+        _rates(each, escape(names[index]), COLORS[index], ("circle", "diamond")[index])
+        for index, each in enumerate((suite, other))
+        if each is not None
+    ]
     tasks = len({name for trace in data for name in trace["y"]})
     layout = _layout(_HEAD + _ROW * tasks * len(data), "success, %")
     layout["xaxis"]["range"] = [-2, 102]
     layout["yaxis"] = {"autorange": "reversed", "automargin": True, "type": "category"}
     return {"data": data, "layout": layout | {"showlegend": len(data) > 1, "scattermode": "group", "scattergap": 0.4}}
+
+
+def _rates(suite: SuiteRun, name: str, color: str, symbol: str) -> Figure:
+    """The trace of a suite's tasks: dots with intervals."""
+    rows = [row for row in suite.summary.tasks if row.rate is not None]
+    low, rate, high = np.array([(row.low, row.rate, row.high) for row in rows], float).reshape(-1, 3).T * 100
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "orientation": "h",
+        "name": name,
+        "x": rate.tolist(),
+        "y": [f"task {row.task}" for row in rows],
+        "error_x": {
+            "type": "data",
+            "symmetric": False,
+            "array": (high - rate).tolist(),
+            "arrayminus": (rate - low).tolist(),
+        },
+        "marker": {"size": 9, "color": color, "symbol": symbol},
+        "text": [f"{escape(row.instruction)}<br>{row.successes}/{row.episodes}" for row in rows],
+        "hovertemplate": "%{text}<br>%{x:.1f} %<extra></extra>",
+    }
 
 
 def success_over_ticks(runs: Sequence[Run]) -> Figure:

@@ -90,7 +90,12 @@ def conditions(run: Run) -> list[Condition]:
 def _suite_conditions(suite: SuiteRun) -> dict[str, str]:
     settings, named = suite.settings("config"), suite.settings("conditions")
     found = {"policy": suite.policy}
-    found |= {name.replace("_", " "): plain(value) for name, value in named.items()}
+    found |= {name.replace("_", " "): plain(value) for name, value in named.items() if name != "instead"}
+    if isinstance(instead := named.get("instead"), Mapping) and instead:
+        changes = [
+            f"{name} {' -> '.join(map(plain, pair))}" for name, pair in instead.items() if isinstance(pair, list)
+        ]
+        found["other than the protocol"] = ", ".join(changes)
     for name in _SETTINGS:
         label = "seed asked for" if name == "seed" else name.replace("_", " ")
         if name in settings and label not in found:

@@ -39,8 +39,8 @@ def video_command(
     from vecenv.contract import ImagesUnavailable
     from vecenv.libero.render.gl import GlError
     from vecenv.libero.render.options import RenderError
+    from vecenv_eval.config import default_policy
     from vecenv_eval.policies import PolicyError, make_policy
-    from vecenv_eval.runner import default_policy
 
     options = {"max_steps": max_steps, "size": size, "lod": lod}
     try:
