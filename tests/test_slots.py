@@ -20,7 +20,7 @@ class Refused(ValueError):
 
 
 class Scripted(SlotBatch):
-    """A simulator that does what it is told: ``tick`` names who succeeds and whose physics fails."""
+    """A simulator controlled by the test: ``tick`` takes the slots that succeed and those whose physics fails."""
 
     _error = Refused
 

@@ -13,8 +13,10 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from vecenv.contract import BatchEnv, Egocentric
+from vecenv.contract import BatchEnv
+from vecenv.observations import Egocentric
 from vecenv_eval.store import Record
 
 
@@ -26,8 +28,8 @@ class Observable(Protocol):
         """Control ticks a second."""
         ...
 
-    def observe_egocentric(self) -> Egocentric:
-        """Cameras and proprioception."""
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
+        """Cameras and proprioception; images of ``slots`` only, if given."""
         ...
 
 
@@ -58,7 +60,8 @@ def watching(env: BatchEnv, watchers: Sequence[EpisodeWatcher]) -> Iterator[None
     """Let watchers observe every tick inside the context; images are rendered once a tick for all of them."""
 
     def observe(actions: np.ndarray, active: np.ndarray) -> None:
-        shared, slots = _OneTick(env), np.flatnonzero(active).tolist()
+        slots = np.flatnonzero(active).tolist()
+        shared = _OneTick(env, slots)
         for watcher in watchers:
             watcher.observe(shared, slots, actions)
 
@@ -70,18 +73,18 @@ def watching(env: BatchEnv, watchers: Sequence[EpisodeWatcher]) -> Iterator[None
 
 
 class _OneTick:
-    """An environment as it stands at one tick: it is observed once, however many watchers look."""
+    """An environment as it stands at one tick: the slots that move are observed once, however many watchers look."""
 
-    def __init__(self, env: Observable) -> None:
-        self._env = env
+    def __init__(self, env: Observable, slots: Sequence[int]) -> None:
+        self._env, self._slots = env, slots
 
     @property
     def control_hz(self) -> float:
         return self._env.control_hz
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
         return self._seen
 
     @cached_property
     def _seen(self) -> Egocentric:
-        return self._env.observe_egocentric()
+        return self._env.observe_egocentric(self._slots)

@@ -12,7 +12,7 @@ from vecenv_eval.episodes import Episode
 from vecenv_eval.video.episodes import VIDEOS, EpisodeVideos, video_path
 from vecenv_eval.watch import watching
 
-from vecenv.contract import ImagesUnavailable
+from vecenv.observations import ImagesUnavailable
 
 av = pytest.importorskip("av")
 

@@ -17,7 +17,7 @@ from support.filmed import SIZE, FilmedEnv, record
 from vecenv_eval.datasets.statistics import ImageCounts, of_values, together
 from vecenv_eval.watch import watching
 
-from vecenv.contract import ImagesUnavailable
+from vecenv.observations import ImagesUnavailable
 
 pq = pytest.importorskip("pyarrow.parquet")
 av = pytest.importorskip("av")

@@ -167,17 +167,12 @@ def test_what_went_wrong_is_said(tmp_path: Path) -> None:
     assert page.index(">error</span>") < page.index(">fault</span>")
 
 
-def test_sanitized_actions_are_counted_where_they_are_recorded(folder: Path) -> None:
-    run = read_run(folder)
-    suite = run.suites[0]
-    records = [*suite.records]
-    for record, (count, first) in zip(records, ((3, 17), (1, 4)), strict=False):
-        object.__setattr__(record, "sanitized", count)
-        object.__setattr__(record, "sanitized_first", first)
-    found = warnings(replace(run, suites=(replace(suite, records=tuple(records)),)))
-    assert found == [
-        "libero_goal: actions were sanitized (not finite, or out of range) in 2 episodes at 4 ticks, "
-        "the earliest at tick 4."
+def test_sanitized_actions_are_counted(tmp_path: Path) -> None:
+    records = some_records(lambda *_: True)
+    for index, (count, first) in enumerate(((3, 17), (1, 4))):
+        records[index] = replace(records[index], sanitized=count, sanitized_first=first)
+    assert warnings(read_run(write_results(tmp_path / "run", records))) == [
+        "libero_goal: actions of 4 calls in 2 episodes were not finite or out of range, the earliest at tick 4."
     ]
 
 
@@ -195,19 +190,15 @@ def test_success_over_ticks_ends_at_the_rate(folder: Path) -> None:
     np.testing.assert_allclose(share, [0, 0.2, 0.4, 0.6, 0.7, 0.7])
 
 
-def test_the_time_budget_needs_recorded_seconds(folder: Path) -> None:
-    run = read_run(folder)
-    assert figures.time_budget(run) is None
-    for record in run.suites[0].records:
-        object.__setattr__(record, "policy_s", 3.0)
-        object.__setattr__(record, "physics_s", 1.0)
+def test_the_time_budget_needs_recorded_seconds(folder: Path, tmp_path: Path) -> None:
+    assert figures.time_budget(read_run(folder)) is None
+    records = some_records(lambda *_: True, policy_s=3.0, physics_s=1.0)
+    run = read_run(write_results(tmp_path / "timed", records))
     budget = figures.time_budget(run)
     assert budget is not None
-    assert [(bar["name"], bar["x"]) for bar in budget["data"]] == [
-        ("policy", [75.0]),
-        ("physics", [25.0]),
-        ("images", [0.0]),
-    ]
+    parts = [(bar["name"], bar["x"]) for bar in budget["data"]]
+    assert parts == [("policy", [75.0]), ("physics", [25.0]), ("images", [0.0])]
+    assert (run.suites[0].summary.wall_s, run.suites[0].summary.setup_s) == (40.0, 1.5)
 
 
 @given(lost=st.integers(0, 40), won=st.integers(0, 40))

@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from vecenv_eval.store import Record
 
-from vecenv.contract import Egocentric
+from vecenv.observations import Egocentric
 
 SIZE = 32
 
@@ -31,12 +32,14 @@ class FilmedEnv:
         self._cameras = {"agentview": SIZE, "wrist": SIZE} if cameras is None else cameras
         self._watchers: list[Callable[[np.ndarray, np.ndarray], None]] = []
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
         self.looks += 1
         images = {}
         for name, height in self._cameras.items():
             shades = 255 - self.shades if name == "wrist" else self.shades
             images[name] = np.full((self.num_envs, height, SIZE, 3), shades[:, None, None, None], np.uint8)
+            if slots is not None:
+                images[name][np.delete(np.arange(self.num_envs), slots)] = 0
         state = np.repeat(self.shades[:, None], self.state, axis=1).astype(np.float32)
         return Egocentric(state=state, images=images)
 

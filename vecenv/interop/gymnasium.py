@@ -160,7 +160,9 @@ class _Slots:
     def begin(self, mask: np.ndarray, episode: Any = None) -> dict[str, np.ndarray]:
         """Begin the next or the given episode in some slots; the others go on. Returns what there is to say of them."""
         slots = np.flatnonzero(mask)
-        self.env.set_some_episodes(slots, self._next(slots) if episode is None else self._given(episode)[slots])
+        self.env.set_episodes(
+            slots=slots, episodes=self._next(slots) if episode is None else self._given(episode)[slots]
+        )
         info = self.env.reset()
         return {"episode_id": np.array(info.episode_id, object), "instruction": np.array(info.instruction, object)}
 

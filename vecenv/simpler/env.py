@@ -1,7 +1,7 @@
-"""The SIMPLER environment: layouts, scenes, controllers and success criteria behind the verbs of ``vecenv.contract``.
+"""The SIMPLER environment: layouts, scenes, controllers and success criteria with the interface of ``vecenv.contract``.
 
 A batch of slots, each with one episode of one task of ``simpler/bridge`` (WidowX, 5 Hz) or ``simpler/google_robot``
-(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``control/controllers.py`` for how an action becomes
+(3 Hz). Read ``vecenv/contract.py`` for what the methods promise, ``control/controllers.py`` for how an action becomes
 set-points, ``physics/scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so
 actions of the whole batch become set-points in one call; scenes are stepped one by one, in worker processes.
 
@@ -12,17 +12,18 @@ An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
-from vecenv.contract import Control, Egocentric, Objects, Rendered, State
+from vecenv.contract import Control, State
 from vecenv.controllers.waypoint import WaypointPlan
+from vecenv.observations import Egocentric, Objects, Rendered
 from vecenv.simpler import snapshot
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.config import SimplerConfig, SimplerError
@@ -37,7 +38,7 @@ from vecenv.simpler.physics.spec import instances
 from vecenv.simpler.published.lists import EpisodeSpec, check_placement, counts, place, scene_of
 from vecenv.simpler.published.lists import episodes as published_episodes
 from vecenv.simpler.tasks import find_task, list_tasks
-from vecenv.simpler.variants import varied
+from vecenv.simpler.variants import make_variant, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
@@ -77,6 +78,7 @@ class SimplerEnv(SlotBatch):
         self._slots: Slots | None = make_slots(self._sizes(), self._num_workers())
         # Where objects of an episode came to rest; settling is the most expensive part of a reset.
         self._settled: dict[tuple[int, int], np.ndarray] = {}
+        self._drawing_s = 0.0
         self._prepared: dict[tuple[int, int], Episode] = {}
         self._camera_poses = CameraPoses(self.robot, self._root)
         self._place(placement)
@@ -90,7 +92,7 @@ class SimplerEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
+    def _chosen(self, tasks: object, episodes: object) -> placing.Placement:
         most = max(counts(self.config.protocol, self.suite).values())
         limits = {"num_tasks": len(self.tasks), "num_episodes": most}
         placement = placing.each(task_indices(self.suite, tasks), episodes, self._placement, **limits)
@@ -103,10 +105,16 @@ class SimplerEnv(SlotBatch):
         self._verdicts = [Verdict(False)] * self.num_envs
         return np.array([self.config.max_steps or each.task.max_steps for each in self._episodes])
 
+    def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:
+        for row in rows.tolist():
+            self._episodes[row] = self._episode(*self._key(row))
+            self._judges[row], self._verdicts[row] = None, Verdict(False)
+        return np.array([self.config.max_steps or self._episodes[row].task.max_steps for row in rows.tolist()])
+
     def _episode(self, task: int, episode: int) -> Episode:
         key = (task, episode)
         if key not in self._prepared:
-            chosen, layout = varied(*scene_of(self._spec(*key)), self.config.variant)
+            chosen, layout = varied(*scene_of(self._spec(*key)), make_variant(self.config.variant))
             made = prepare(chosen, layout, self._root)
             if self.config.variant is not None:
                 require_drawable(made, self._root)
@@ -182,10 +190,11 @@ class SimplerEnv(SlotBatch):
         chunk[..., 6] = self._native_gripper(chunk[..., 6])
         self._servo.forget(np.ones(self.num_envs, bool))
         before, reward = self._steps.copy(), np.zeros(self.num_envs)
-        for tick in range(chunk.shape[1]):
-            if self.done.all():
-                break
-            reward += self._tick(chunk[:, tick], ~self.done)
+        with self._stepping():
+            for tick in range(chunk.shape[1]):
+                if self.done.all():
+                    break
+                reward += self._tick(chunk[:, tick], ~self.done)
         return self._control(Control, reward, before, sanitized)
 
     def _native_gripper(self, values: np.ndarray) -> np.ndarray:
@@ -241,8 +250,11 @@ class SimplerEnv(SlotBatch):
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
         """What every slot's camera sees now, and its joints; images are rendered when they are first read.
+
+        Args:
+            slots: draw these slots only, bool [B] or indices; the images of the others are black. None: all.
 
         ``state`` is qpos, qvel and base pose (xyz, wxyz), float32 [B, 23] or [B, 29]. The only camera is the
         third-person one, 480 x 640 or 512 x 640; ``wrist_image`` is None. A slot whose physics failed shows black.
@@ -250,7 +262,7 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         facts = self._facts.copy()
         state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
-        healthy = [slot for slot, fault in enumerate(self._fault) if not fault]
+        healthy: list[int] = [slot for slot in self.slot_indices(slots).tolist() if not self._fault[slot]]
         images = LazyImages(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
         cameras = [episode.task.camera for episode in self._episodes]
         return SimplerEgocentric(
@@ -267,13 +279,21 @@ class SimplerEnv(SlotBatch):
         style = RenderStyle(overlay=self.config.overlay, shadows=self.config.shadows)
         buffer = ImageBuffer(slots=self.num_envs, height=camera.height, width=camera.width, deep=deep)
         subjects = {slot: (RenderSubject.of(episode, self._root), facts) for slot, (episode, facts) in slots.items()}
-        return self.slots.draw(style, buffer, subjects)
+        started = time.perf_counter()
+        try:
+            return self.slots.draw(style, buffer, subjects)
+        finally:
+            self._drawing_s += time.perf_counter() - started
 
-    def observe_objects(self, points: str = "surface") -> Objects:
+    def _images_s(self) -> float:
+        return self._drawing_s
+
+    def observe_objects(self, points: str = "surface", slots: npt.ArrayLike | None = None) -> Objects:
         """Ground truth of every slot.
 
         Args:
             points: ``"surface"``, points on the collision meshes; or ``"aabb"``, on the faces of the box around them.
+            slots: of these slots only, bool [B] or indices; the others have no snapshot. None: all.
 
         Raises:
             SimplerError: another value.
@@ -281,17 +301,19 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         if points not in ("surface", "aabb"):
             raise SimplerError(f"points={points!r}: expected 'surface' or 'aabb'")
+        wanted = np.isin(np.arange(self.num_envs), self.slot_indices(slots))
+        rows = zip(wanted, self._episodes, self._facts, self._fault, strict=True)
         return Objects(
             snapshot=tuple(
-                None if fault else snapshot.take(episode, facts, points)
-                for episode, facts, fault in zip(self._episodes, self._facts, self._fault, strict=True)
+                snapshot.take(episode, facts, points) if asked and not fault else None
+                for asked, episode, facts, fault in rows
             ),
             error=tuple(f"physics failed: {reason}" if reason else "" for reason in self._fault),
         )
 
     @property
     def stand_ins(self) -> tuple[tuple[str, ...], ...]:
-        """For each slot, notes about missing files and what stands in for them."""
+        """For each slot, notes about missing files and their stand-ins."""
         return tuple(episode.notes for episode in self._episodes)
 
     # -- physics state -------------------------------------------------------------------------------------------------
@@ -364,7 +386,7 @@ class SimplerEnv(SlotBatch):
         return np.concatenate([qpos[:dof], qvel[:dof], qpos[dof:joints], qvel[dof:joints], things.ravel()])
 
 
-def task_indices(suite: str, tasks: Any) -> Any:
+def task_indices(suite: str, tasks: object) -> object:
     """Indices of tasks given by name, index, or several of either; None stays None."""
     if tasks is None or isinstance(tasks, Mapping):
         return tasks

@@ -98,7 +98,7 @@ class LeRobotWriter:
         """
         if not len(slots):
             return
-        seen, fps = env.observe_egocentric(), self._fps(env.control_hz)
+        seen, fps = env.observe_egocentric(slots), self._fps(env.control_hz)
         images = camera_images(seen, tuple(self._image_keys))
         for slot in slots:
             rollout = self._rollouts.setdefault(slot, _Rollout())

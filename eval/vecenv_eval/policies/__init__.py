@@ -18,9 +18,13 @@ from vecenv.contract import BatchEnv, Control, ResetInfo
 from vecenv.errors import InvalidInput
 
 BUILTIN = {
+    "gr00t": "vecenv_eval.clients.gr00t:Gr00tPolicy",
+    "openpi": "vecenv_eval.clients.openpi:OpenPiPolicy",
     "pick_place": "vecenv_eval.policies.pick_place.policy:PickPlacePolicy",
     "random": "vecenv_eval.policies.random:RandomPolicy",
     "simpler_scripted": "vecenv_eval.policies.simpler.policy:SimplerScriptedPolicy",
+    "starvla": "vecenv_eval.clients.starvla:StarVLAPolicy",
+    "vla-eval": "vecenv_eval.clients.vla_eval:VlaEvalPolicy",
     "voxposer": "vecenv_eval.policies.voxposer:VoxPoserPolicy",
     "zero": "vecenv_eval.policies.scripted:ZeroPolicy",
 }
@@ -60,6 +64,43 @@ class Reporting(Protocol):
 
     def extras(self, slot: int) -> Mapping[str, Any]:
         """Numbers and words about the episode in a slot, which has just finished; they go into its record."""
+        ...
+
+
+@runtime_checkable
+class Refillable(Protocol):
+    """A policy whose slots may begin new episodes one by one; optional.
+
+    With it, a slot whose episode has ended takes the next one at once. Without it, the harness waits until every slot
+    has finished, and calls ``reset`` for the next batch.
+    """
+
+    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
+        """Begin new episodes in some slots, while the others continue theirs.
+
+        Args:
+            env: the environment, in which the slots were just reset.
+            info: what its reset returned, for all slots.
+            slots: indices of the slots that begin, ascending.
+        """
+        ...
+
+
+@runtime_checkable
+class Closing(Protocol):
+    """A policy that holds connections or files; optional."""
+
+    def close(self) -> None:
+        """Release them; called when the run ends, however it ends."""
+        ...
+
+
+@runtime_checkable
+class Ending(Protocol):
+    """A policy that learns how episodes end, to log or to learn; optional."""
+
+    def episode_end(self, slot: int, record: Mapping[str, Any]) -> None:
+        """An episode has ended: its slot, and its record (``vecenv_eval.store.Record``) as plain values."""
         ...
 
 

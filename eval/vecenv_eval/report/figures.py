@@ -95,10 +95,7 @@ def solved_within(suite: SuiteRun) -> tuple[np.ndarray, np.ndarray]:
 
 def seconds(suite: SuiteRun) -> Mapping[str, float]:
     """Seconds that episodes spent in each part, summed over them; empty where none were recorded."""
-    found = {
-        name: float(sum(getattr(record, field, None) or 0.0 for record in suite.records))
-        for field, name in PARTS.items()
-    }
+    found = {name: float(sum(getattr(record, field) for record in suite.records)) for field, name in PARTS.items()}
     return {name: value for name, value in found.items() if value > 0}
 
 

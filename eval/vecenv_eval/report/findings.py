@@ -63,14 +63,13 @@ def _suite_warnings(suite: SuiteRun) -> list[str]:
 
 def _sanitized_warning(records: Iterable[Record]) -> list[str]:
     """Episodes whose policy sent actions that could not be executed as they were."""
-    counts = {record.key: getattr(record, "sanitized", 0) or 0 for record in records}
-    touched = [record for record in records if counts[record.key]]
+    touched = [record for record in records if record.sanitized]
     if not touched:
         return []
-    ticks = sum(int(counts[record.key]) for record in touched)
-    firsts = [first for record in touched if (first := getattr(record, "sanitized_first", None)) is not None]
+    calls = sum(record.sanitized for record in touched)
+    firsts = [record.sanitized_first for record in touched if record.sanitized_first is not None]
     since = f", the earliest at tick {min(firsts)}" if firsts else ""
-    return [f"actions were sanitized (not finite, or out of range) in {len(touched)} episodes at {ticks} ticks{since}."]
+    return [f"actions of {calls} calls in {len(touched)} episodes were not finite or out of range{since}."]
 
 
 def _causes(texts: Iterable[str]) -> str:

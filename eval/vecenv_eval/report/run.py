@@ -24,8 +24,8 @@ PAPER_NAMES = {
     "libero_10": "Long",
     "libero_90": "LIBERO-90",
 }
-_NUMBERS = ("task", "episode", "num_steps")
-_SECONDS = ("wall_s", "setup_s")
+_NUMBERS = ("task", "episode", "num_steps", "sanitized", "run", "batch")
+_SECONDS = ("wall_s", "setup_s", "policy_s", "physics_s", "images_s")
 _TEXTS = ("suite", "instruction", "fault", "error")
 
 

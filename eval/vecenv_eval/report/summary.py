@@ -180,12 +180,17 @@ def _extras(records: Sequence[Record]) -> dict[str, float | dict[str, int]]:
     return result
 
 
-def _seconds(records: Iterable[Record]) -> tuple[float, float]:
-    """Seconds of setup and of running; a batch lasts until its last episode ends."""
-    setup: dict[tuple[int, int], float] = {}
+def _seconds(records: Sequence[Record]) -> tuple[float, float]:
+    """Seconds of setup and of running.
+
+    Slots that are placed together note the same setup. Shares of policy, physics and images add up to the time of
+    running; of a batch without them, the time is that until its last episode ended.
+    """
+    setup = {(record.run, record.batch, record.setup_s) for record in records}
+    shares: dict[tuple[int, int], float] = {}
     wall: dict[tuple[int, int], float] = {}
     for record in records:
         key = (record.run, record.batch)
-        setup[key] = max(setup.get(key, 0.0), record.setup_s)
+        shares[key] = shares.get(key, 0.0) + record.policy_s + record.physics_s + record.images_s
         wall[key] = max(wall.get(key, 0.0), record.wall_s)
-    return sum(setup.values()), sum(wall.values())
+    return sum(seconds for *_, seconds in setup), sum(shares[key] or wall[key] for key in wall)

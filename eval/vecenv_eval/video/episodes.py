@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vecenv.contract import Egocentric, ImagesUnavailable, Rendered
+from vecenv.observations import Egocentric, ImagesUnavailable, Rendered
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store import Record
 from vecenv_eval.video.writer import VideoWriter
@@ -63,7 +63,7 @@ class EpisodeVideos:
         """
         if not len(slots):
             return
-        images = camera_images(env.observe_egocentric(), self._cameras)
+        images = camera_images(env.observe_egocentric(slots), self._cameras)
         for slot in slots:
             if slot not in self._open:
                 self._open[slot] = VideoWriter(self._partial / f"{slot}.mp4", env.control_hz, crf=_CRF)
