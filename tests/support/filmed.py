@@ -39,7 +39,7 @@ class FilmedEnv:
             shades = 255 - self.shades if name == "wrist" else self.shades
             images[name] = np.full((self.num_envs, height, SIZE, 3), shades[:, None, None, None], np.uint8)
             if slots is not None:
-                images[name][np.delete(np.arange(self.num_envs), slots)] = 0
+                images[name][~np.isin(np.arange(self.num_envs), np.asarray(slots))] = 0
         state = np.repeat(self.shades[:, None], self.state, axis=1).astype(np.float32)
         return Egocentric(state=state, images=images)
 

@@ -13,6 +13,7 @@ from typing import Any
 from scipy.stats import binomtest
 
 from vecenv_eval.episodes import Episode
+from vecenv_eval.report.findings import plain
 from vecenv_eval.report.run import Run
 from vecenv_eval.store import Record
 
@@ -114,7 +115,7 @@ def _conditions(run: Run) -> dict[str, dict[str, Any]]:
             **{
                 name: suite.settings("config").get(name) for name in ("policy_args", "backend", "env_args", "max_steps")
             },
-            **suite.settings("conditions"),
+            **{name: value for name, value in suite.settings("conditions").items() if name != "instead"},
         }
         for suite in run.suites
     }
@@ -130,5 +131,5 @@ def _differences(
         for name in ours[suite] | theirs[suite]:
             one, two = ours[suite].get(name), theirs[suite].get(name)
             if one != two:
-                found[f"{suite}: {name}" if len(shared) > 1 else name] = (str(one), str(two))
+                found[f"{suite}: {name}" if len(shared) > 1 else name] = (plain(one), plain(two))
     return found
