@@ -39,9 +39,9 @@ def video_command(
     from vecenv.libero.render.gl import GlError
     from vecenv.libero.render.options import RenderError
     from vecenv.observations import ImagesUnavailable
+    from vecenv_eval.config import default_policy
     from vecenv_eval.policies import PolicyError, make_policy
-    from vecenv_eval.runner import default_policy
-    from vecenv_eval.video.episodes import make_env, record_rollout
+    from vecenv_eval.video.rollout import make_env, record_rollout
 
     options = {"max_steps": max_steps, "size": size, "lod": lod}
     try:

@@ -1,71 +1,122 @@
-"""A policy runs one batch of episodes, and what its cameras see is written to one mp4.
+"""A video of each episode of an evaluation: one mp4, third-person and wrist camera side by side.
 
-In: an environment and a policy, or the names of a suite and a task. Out: the file. LIBERO's images have the size and
-level of detail that are requested; SIMPLER's are as large as its camera's, and its videos run at its robots' 5 or 3
-control steps per second.
+A results folder and what to keep come in; ``videos/{suite}_{task}_{episode}.mp4`` go out. Frames are encoded as they
+come, so memory does not grow with the length of an episode: an encoder takes about 5 MB for two images of 256 x 256.
+A runner uses :class:`EpisodeVideos` like any watcher (``vecenv_eval.watch``)::
+
+    videos = EpisodeVideos(folder, keep="failures")
+    with watching(env, [videos]):
+        ...  # whenever the episode in a slot ends, and before the slot is placed anew:
+        videos.finish(slot, record)
+    videos.close()
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
 
-import vecenv
-from vecenv.contract import BatchEnv, Control
-from vecenv.libero.render.options import RenderConfig
-from vecenv_eval.policies import Policy
-from vecenv_eval.video import LOD, MAX_STEPS, SIZE
-from vecenv_eval.video.writer import CONTROL_HZ, Recordable, recording
+import numpy as np
+
+from vecenv.observations import Egocentric, ImagesUnavailable, Rendered
+from vecenv_eval.episodes import Episode
+from vecenv_eval.store import Record
+from vecenv_eval.video.writer import VideoWriter
+from vecenv_eval.watch import Observable
+
+VIDEOS = "videos"
+# What ``vecenv eval --video`` takes.
+NONE, FAILURES, ALL = VIDEO_CHOICES = ("none", "failures", "all")
+CAMERAS = ("agentview", "wrist")
+_PARTIAL = ".partial"
+# Good enough to see what went wrong: 5 s of two images of 256 x 256 take about 0.4 MB.
+_CRF = 23
 
 
-class RecordableEnv(BatchEnv, Recordable, Protocol):
-    """An environment that a policy can run and ``recording`` can watch."""
+def video_path(folder: Path, episode: Episode) -> Path:
+    """Where the video of an episode goes: ``folder/videos/{suite}_{task}_{episode}.mp4``; ``/`` becomes ``-``."""
+    suite = re.sub(r"[^\w.-]+", "-", episode.suite)
+    return folder / VIDEOS / f"{suite}_{episode.task}_{episode.episode}.mp4"
 
 
-def record_rollout(env: RecordableEnv, policy: Policy, out: Path, cameras: Sequence[str]) -> int:
-    """Run a batch from its start to its end and record it, at the robot's control rate.
+class EpisodeVideos:
+    """A watcher that writes one mp4 an episode.
 
     Args:
-        env: an environment as ``vecenv.make`` returns it.
-        policy: see ``vecenv_eval.policies``.
-        out: the mp4.
-        cameras: shown side by side.
-
-    Returns:
-        The number of frames written: one per control step, and one that shows the end.
+        folder: the results folder.
+        keep: ``"all"``, or ``"failures"``: episodes that were not solved, ended in a fault or in an error.
+        cameras: shown side by side; those that an environment does not have are left out.
     """
-    policy.reset(env, env.reset())
-    robot = getattr(env, "robot", None)  # SIMPLER's environments have one
-    rate = CONTROL_HZ if robot is None else robot.control_hz
-    with recording(env, out, cameras=cameras, fps=rate) as video:
-        done = False
-        while not done:
-            acted = policy.act(env)
-            control = acted if isinstance(acted, Control) else env.step_continuous(acted)
-            done = bool(control.done.all())
-    return video.frames
+
+    def __init__(self, folder: Path, keep: str = FAILURES, cameras: Sequence[str] = CAMERAS) -> None:
+        self._folder, self._keep, self._cameras = folder, keep, tuple(cameras)
+        self._open: dict[int, VideoWriter] = {}
+
+    def observe(self, env: Observable, slots: Sequence[int], actions: np.ndarray | None = None) -> None:
+        """Add a frame for each slot.
+
+        Raises:
+            ImagesUnavailable: the environment has none of the cameras.
+            RenderError: PyAV is not installed.
+        """
+        if not len(slots):
+            return
+        images = camera_images(env.observe_egocentric(slots), self._cameras)
+        for slot in slots:
+            if slot not in self._open:
+                self._open[slot] = VideoWriter(self._partial / f"{slot}.mp4", env.control_hz, crf=_CRF)
+            self._open[slot].add(side_by_side([of_camera[slot] for of_camera in images.values()]))
+
+    def finish(self, slot: int, record: Record, env: Observable | None = None) -> None:
+        """Keep the video of the episode that ended in a slot, or drop it.
+
+        Args:
+            slot: where it ran; without any observation there, nothing happens.
+            record: how it ended.
+            env: the environment while the slot still shows the end, which becomes the last frame.
+        """
+        if slot not in self._open:
+            return
+        kept = self._keep == ALL or not record.success or bool(record.error)
+        if kept and env is not None:
+            self.observe(env, [slot])
+        video = self._open.pop(slot)
+        video.close()
+        if kept:
+            video.path.replace(video_path(self._folder, record.key))
+        else:
+            video.path.unlink()
+
+    def close(self) -> None:
+        """Drop the videos of episodes that have not finished."""
+        for video in self._open.values():
+            video.close()
+        self._open.clear()
+        shutil.rmtree(self._partial, ignore_errors=True)
+
+    @property
+    def _partial(self) -> Path:
+        return self._folder / VIDEOS / _PARTIAL
 
 
-def make_env(suite: str, task: str, episodes: int, options: Mapping[str, Any]) -> RecordableEnv:
-    """The batch to record.
-
-    Args:
-        suite: its name.
-        task: index or name.
-        episodes: how many, from the first.
-        options: ``max_steps``, ``size`` and ``lod``, those that were given.
+def camera_images(seen: Egocentric, cameras: Sequence[str]) -> dict[str, np.ndarray]:
+    """The images of those cameras that there are, by name, uint8 [B, H, W, 3] each.
 
     Raises:
-        ValueError, LookupError: a name does not exist, or the suite does not have the option.
+        ImagesUnavailable: there is none of them.
     """
-    chosen, more = int(task) if task.isdecimal() else task, dict(options)
-    if suite.split("/")[0] == "simpler":
-        given = [f"--{name}" for name in ("size", "lod") if name in more]
-        if given:
-            raise ValueError(f"{' and '.join(given)}: SIMPLER's images are as large and as detailed as upstream's")
-    else:
-        size = more.pop("size", SIZE)
-        more["render"] = RenderConfig(height=size, width=size, lod=more.pop("lod", LOD))
-        more.setdefault("max_steps", MAX_STEPS)
-    return cast("RecordableEnv", vecenv.make(suite, task=chosen, episodes=range(episodes), **more))
+    names = [name for name in cameras if name in seen.images]
+    if not names:
+        there = f"there are: {', '.join(seen.images)}" if seen.images else "this environment renders nothing"
+        raise ImagesUnavailable(f"no image of {' or '.join(cameras)}: {there}")
+    if isinstance(seen.images, Rendered):
+        seen.images.prepare(*names)
+    return {name: seen.images[name] for name in names}
+
+
+def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Images [H, W, 3] in a row, lower ones filled up with black."""
+    height = max(image.shape[0] for image in images)
+    return np.concatenate([np.pad(image, ((0, height - len(image)), (0, 0), (0, 0))) for image in images], axis=1)

@@ -1,0 +1,1 @@
+"""Datasets for imitation learning, written while policies run."""
