@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 ALL = "all"
+VIDEO_CHOICES = ("none", "failures", "all")
 # Policies that know a benchmark's scenes, by the family of suites they are made for.
 SCRIPTED = {"libero": "pick_place", "simpler": "simpler_scripted"}
 _KEY = "setting"
@@ -142,9 +143,18 @@ class EvalConfig:
             "How often episodes that ended in an error run again in the same run.", minimum=0, resumable=True
         ),
     )
+    video: str = field(
+        default="none",
+        metadata=_about("Write one mp4 an episode into DIR/videos: failures, all or none.", resumable=True),
+    )
+    record_lerobot: bool = field(
+        default=False, metadata=_about("Write the run as a LeRobot dataset into DIR/lerobot.", resumable=True)
+    )
     fail_fast: bool = field(default=False, metadata=_about("Stop at the first batch that raises.", resumable=True))
 
     def __post_init__(self) -> None:
+        if self.video not in VIDEO_CHOICES:
+            raise ConfigError(f"video={self.video!r}: expected one of {', '.join(VIDEO_CHOICES)}")
         for each in fields(self):
             value, minimum = getattr(self, each.name), setting(each).minimum
             if minimum is not None and value is not None and value < minimum:

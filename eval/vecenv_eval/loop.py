@@ -22,6 +22,7 @@ from vecenv.contract import BatchEnv, Control, Metrics
 from vecenv_eval.clocks import EpisodeClocks
 from vecenv_eval.conditions import conditions
 from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.datasets.lerobot import LeRobotWriter
 from vecenv_eval.drive import drive
 from vecenv_eval.environments import Environments, Placed, make_arguments, slots_of
 from vecenv_eval.episodes import Episode, Stream, Suite
@@ -29,6 +30,8 @@ from vecenv_eval.policies import Ending, Policy, Refillable, extras_of
 from vecenv_eval.results import Progress, count
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.store import Record, ResultStore
+from vecenv_eval.video.episodes import NONE, EpisodeVideos
+from vecenv_eval.watch import watching
 
 # Called with which slots have just finished, bool [B], with the verdicts, bool [B], and with the faults, B strings.
 _Finish: TypeAlias = Callable[[np.ndarray, np.ndarray, Sequence[str]], None]
@@ -75,6 +78,8 @@ class EpisodeLoop:
         self._records = {key: r for key, r in store.records().items() if key in wanted and not r.error}
         self._progress = _ProgressReports(on_progress, len(wanted), self._records)
         self._environments = Environments(simulator, suite, config, self._write_conditions)
+        self._videos = None if config.video == NONE else EpisodeVideos(store.folder, config.video)
+        self._dataset = LeRobotWriter(store.folder / "lerobot") if config.record_lerobot else None
         self._number = self._failures = self._verdicts = 0
         self._refill_share = _SHARE_TO_REFILL.get(config.backend, _GPU_SHARE)
 
@@ -101,6 +106,8 @@ class EpisodeLoop:
             return True
         finally:
             self._environments.close()
+            for watcher in self._watchers:
+                watcher.close()
         return False
 
     def _run_all(self, queue: deque[Stream]) -> bool:
@@ -134,7 +141,7 @@ class EpisodeLoop:
             return Stream(stream.suite, ())
         running = _Running(self._suite, placed, stream)
         try:
-            with self._recording(running) as (begin, finish):
+            with self._recording(running) as (begin, finish), watching(placed.env, self._watchers):
                 self._run_placed(number, running, begin, finish)
         except Exception as error:  # whatever a policy or a simulator raises concerns the running episodes only
             self._write_errors(number, running.slots, error)
@@ -169,7 +176,9 @@ class EpisodeLoop:
             if finished.any():
                 metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
                 finish(finished, metrics.success, control.info["fault"])
-                self._write([self._record(number, running, i, metrics, control, clocks) for i in slots])
+                records = [self._record(number, running, i, metrics, control, clocks) for i in slots]
+                self._finish_watchers(env, slots, records)
+                self._write(records)
                 self._verdicts += len(slots)
                 self._tell_policy(running, slots)
             progress.steps, progress.seconds = (
@@ -177,6 +186,17 @@ class EpisodeLoop:
                 before[1] + clocks.now(),
             )
             progress.report(number)
+
+    def _finish_watchers(self, env: BatchEnv, slots: Sequence[int], records: Sequence[Record]) -> None:
+        for slot, record in zip(slots, records, strict=True):
+            if self._videos is not None:
+                self._videos.finish(slot, record, env)
+            if self._dataset is not None:
+                self._dataset.finish(slot, record)
+
+    @property
+    def _watchers(self) -> list[EpisodeVideos | LeRobotWriter]:
+        return [watcher for watcher in (self._videos, self._dataset) if watcher is not None]
 
     def _tell_policy(self, running: _Running, slots: Sequence[int]) -> None:
         if isinstance(self._policy, Ending):

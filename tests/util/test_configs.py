@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ class Options:
     scale: float = 1.0
     flag: bool = False
     size: Size = field(default_factory=Size)
+    mode: Literal["soft", "hard"] = "soft"
     either: Mapping[str, Any] | Size | None = None
 
 
@@ -52,12 +53,16 @@ def test_numpy_scalars_are_numbers() -> None:
 @pytest.mark.parametrize(
     ("fields", "says"),
     [
-        ({"stps": 3}, r"it has no option stps=3; did you mean steps\?; its own: steps, scale, flag, size, either"),
+        (
+            {"stps": 3},
+            r"it has no option stps=3; did you mean steps\?; its own: steps, scale, flag, size, mode, either",
+        ),
         ({"steps": "3"}, "steps.*int"),
         ({"steps": True}, "steps=True.*not a bool"),
         ({"size": {"depth": 1}}, "depth"),
         ({"size": {"width": "wide"}}, "width"),
         ({"either": True}, "either"),
+        ({"mode": "wet"}, "mode='wet' is not available; available: soft, hard"),
         ({"flag": 1}, "flag.*bool"),
     ],
 )

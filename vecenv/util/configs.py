@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 import re
 from collections.abc import Mapping
-from typing import TypeVar, get_type_hints
+from typing import Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import dacite
 import numpy as np
@@ -57,6 +57,9 @@ def _plain(name: str, value: object, hint: object, what: str, error: type[Except
     """NumPy scalars as Python's; a bool is not taken for a number, though Python says that it is one."""
     if isinstance(value, np.generic):
         value = value.item()
+    choices = get_args(hint) if get_origin(hint) is Literal else ()
+    if choices and value not in choices:
+        raise error(f"{what}: {name}={value!r} is not available; available: {', '.join(map(str, choices))}")
     if isinstance(value, bool) and "bool" not in str(hint) and "Any" not in str(hint):
         raise error(f"{what}: {name}={value!r}: expected {getattr(hint, '__name__', hint)}, not a bool")
     return value

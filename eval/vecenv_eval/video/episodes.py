@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from vecenv.observations import Egocentric, ImagesUnavailable, Rendered
+from vecenv_eval.config import VIDEO_CHOICES
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store import Record
 from vecenv_eval.video.writer import VideoWriter
@@ -28,7 +29,7 @@ from vecenv_eval.watch import Observable
 
 VIDEOS = "videos"
 # What ``vecenv eval --video`` takes.
-NONE, FAILURES, ALL = VIDEO_CHOICES = ("none", "failures", "all")
+NONE, FAILURES, ALL = VIDEO_CHOICES
 CAMERAS = ("agentview", "wrist")
 _PARTIAL = ".partial"
 # Good enough to see what went wrong: 5 s of two images of 256 x 256 take about 0.4 MB.
