@@ -6,10 +6,11 @@ In: which episode sits in which slot, and from a simulator, ticks, successes and
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NoReturn, Self, SupportsIndex, TypeVar
 
 import numpy as np
 
@@ -37,6 +38,7 @@ class SlotBatch(ABC):
         self.suite, self.num_envs = suite, num_envs
         self._until_success = success == FIRST
         self._closed = False
+        self._process = os.getpid()
         self._watchers: list[Watcher] = []
 
     # -- what the simulator supplies -----------------------------------------------------------------------------------
@@ -305,9 +307,43 @@ class SlotBatch(ABC):
         """Which slots have finished their episode, bool [B]."""
         return self._terminated | self._truncated
 
+    def close(self) -> None:
+        """Release the simulator; closing twice is harmless."""
+        self._closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        about = [f"{self.num_envs} slot{'' if self.num_envs == 1 else 's'}"]
+        if self._closed:
+            about.append("closed")
+        elif self._live.all():
+            about.append(f"{int((~self.done).sum())} running, {int(self._success.sum())} successful")
+        else:
+            about.append("waiting for reset()")
+        tasks = ", ".join(dict.fromkeys(self._label(int(task)) for task in self._placement.task))
+        return f"<{type(self).__name__} {self.suite}, tasks {tasks}: {'; '.join(about)}>"
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
+        raise self._error(
+            f"{type(self).__name__} cannot be pickled or copied: it holds a running simulator. Send a function that "
+            "makes one, such as functools.partial(vecenv.make, suite, tasks=..., episodes=...), and call it in the "
+            "process that uses it; to save the physics use state() and set_state()"
+        )
+
     def _check_open(self) -> None:
         if self._closed:
             raise self._error("the environment is closed")
+        if os.getpid() != self._process:
+            raise self._error(
+                f"the environment was made in process {self._process} and this is process {os.getpid()}: its threads "
+                "and renderer do not survive a fork. Call vecenv.make in the process that uses it, or start processes "
+                "with multiprocessing.get_context('spawn')"
+            )
 
     def _check_live(self) -> None:
         self._check_open()

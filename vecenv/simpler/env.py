@@ -90,6 +90,25 @@ class SimplerEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
+    def set_some_episodes(self, slots: npt.ArrayLike, episodes: npt.ArrayLike) -> None:
+        """Choose what some slots run next, of the task they have; ``reset`` begins it, and the others continue.
+
+        Args:
+            slots: their indices, or bool [B].
+            episodes: episode of each of them, or one for all.
+
+        Raises:
+            PlacementError, PublishedError: an episode that does not exist.
+        """
+        self._check_open()
+        chosen = self._placement.episode.copy()
+        chosen[np.asarray(slots)] = episodes
+        self._placement = self._chosen(None, chosen)
+        for slot in np.arange(self.num_envs)[np.asarray(slots)]:
+            self._episodes[slot] = self._episode(*self._key(slot))
+            self._max_steps[slot] = self.config.max_steps or self._episodes[slot].task.max_steps
+        self._live[np.asarray(slots)] = False
+
     def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
         most = max(counts(self.config.protocol, self.suite).values())
         limits = {"num_tasks": len(self.tasks), "num_episodes": most}
