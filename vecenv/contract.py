@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, Protocol, Self, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -443,6 +443,19 @@ class Metrics:
 
 
 @dataclass(frozen=True)
+class Timings:
+    """Where an environment's time went since it was made, seconds of wall clock.
+
+    Attributes:
+        physics_s: stepping and resetting.
+        images_s: rendering images.
+    """
+
+    physics_s: float = 0.0
+    images_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class State:
     """Physics state of every slot.
 
@@ -491,6 +504,11 @@ class BatchEnv(Protocol):
         """Which slots have finished their episode, bool [B]; the others are live, or wait for ``reset``."""
         ...
 
+    @property
+    def timings(self) -> Timings:
+        """Seconds spent so far in physics and in rendering images."""
+        ...
+
     def instructions(self) -> tuple[str, ...]:
         """What each slot's policy is told at present; some SIMPLER tasks have two instructions in turn."""
         ...
@@ -511,12 +529,12 @@ class BatchEnv(Protocol):
         """Follow a plan, waypoints [B, T]."""
         ...
 
-    def observe_egocentric(self) -> Egocentric:
-        """Cameras and proprioception."""
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
+        """Cameras and proprioception; images of some slots only, where ``slots`` says which."""
         ...
 
-    def observe_objects(self, points: str = "surface") -> Objects:
-        """Ground truth."""
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
+        """Ground truth; of some slots only, where ``slots`` says which."""
         ...
 
     def evaluate(self) -> Metrics:
@@ -535,10 +553,18 @@ class BatchEnv(Protocol):
         """While inside, ``watcher`` is called before every tick of an episode."""
         ...
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
-        """Choose what each slot runs next, then call ``reset``."""
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None, slots: Any = None) -> None:
+        """Choose what each slot runs next, or some slots while the others continue; then call ``reset``."""
         ...
 
     def close(self) -> None:
         """Release the simulator, once, at the end."""
+        ...
+
+    def __enter__(self) -> Self:
+        """``with vecenv.make(...) as env``: the environment is closed at the end of the block."""
+        ...
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
         ...

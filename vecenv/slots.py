@@ -7,6 +7,7 @@ In: which episode sits in which slot, and from a simulator, ticks, successes and
 from __future__ import annotations
 
 import os
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,11 +16,13 @@ from typing import Any, ClassVar, NoReturn, Self, SupportsIndex, TypeVar
 import numpy as np
 
 from vecenv import actions as action_space
-from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo, Watcher
+from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo, Timings, Watcher
 from vecenv.controllers.waypoint import WaypointPlan
-from vecenv.placement import Placement
+from vecenv.placement import Placement, PlacementError
 
 _Kind = TypeVar("_Kind", bound=Control)
+# Tasks that ``repr`` names before it only counts them.
+_LISTED = 8
 
 
 class SlotBatch(ABC):
@@ -40,6 +43,7 @@ class SlotBatch(ABC):
         self._closed = False
         self._process = os.getpid()
         self._watchers: list[Watcher] = []
+        self._physics_s = 0.0
 
     # -- what the simulator supplies -----------------------------------------------------------------------------------
 
@@ -94,18 +98,76 @@ class SlotBatch(ABC):
         """Task and episode of each slot."""
         return self._placement
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None, slots: Any = None) -> None:
         """Choose what each slot runs next; ``reset`` makes it live.
 
         Args:
-            tasks: task of each slot, by index or in SIMPLER also by name (B of them, or one for all); None keeps them.
-            episodes: episode of each slot, 0 to 49, likewise.
+            tasks: task of each slot, by index or name (B of them, or one for all); None keeps them.
+            episodes: episode of each slot, likewise.
+            slots: which slots ``tasks`` and ``episodes`` are for, bool [B] or indices; the other slots continue their
+                episodes. None: all of them. In LIBERO a slot's new task must share its scene.
 
         Raises:
             PlacementError, UnknownTask: something that does not exist, or a wrong number of them.
+            ValueError: a subclass; a task of another scene while other slots continue.
         """
         self._check_open()
-        self._place(self._chosen(tasks, episodes))
+        if slots is None:
+            self._place(self._chosen(tasks, episodes))
+            return
+        rows = self.slot_indices(slots)
+        if len(rows):
+            self._replace(
+                rows, self._chosen(self._of_all(tasks, rows, "task"), self._of_all(episodes, rows, "episode"))
+            )
+
+    def slot_indices(self, slots: Any) -> np.ndarray:
+        """Indices of slots, ascending, from bool [B], indices, or None for all.
+
+        Raises:
+            PlacementError: a mask of another length, or a slot that does not exist.
+        """
+        if slots is None:
+            return np.arange(self.num_envs)
+        given = np.asarray(slots)
+        if given.dtype == bool:
+            if given.shape != (self.num_envs,):
+                raise PlacementError(f"slots: a mask of shape {list(given.shape)}; expected [{self.num_envs}]")
+            return np.flatnonzero(given)
+        rows = np.atleast_1d(given)
+        if rows.ndim != 1 or (rows.size and not np.issubdtype(rows.dtype, np.integer)):
+            raise PlacementError(f"slots={slots!r}: expected bool [{self.num_envs}] or indices")
+        if rows.size and (rows.min() < 0 or rows.max() >= self.num_envs):
+            raise PlacementError(f"slots={slots!r}: there are slots 0 to {self.num_envs - 1}")
+        if len(np.unique(rows)) < len(rows):
+            raise PlacementError(f"slots={slots!r}: a slot is named twice")
+        return np.sort(rows).astype(int)
+
+    def _of_all(self, given: Any, rows: np.ndarray, what: str) -> Any:
+        """What each of B slots is to have, from what the slots ``rows`` are to have."""
+        if given is None:
+            return None
+        values = [given] * len(rows) if isinstance(given, (str, int, np.integer)) else list(given)
+        if len(values) != len(rows):
+            raise PlacementError(f"{len(values)} {what}s for {len(rows)} slots")
+        merged: list[Any] = getattr(self._placement, what).tolist()
+        for row, value in zip(rows.tolist(), values, strict=True):
+            merged[row] = value
+        return merged
+
+    def _replace(self, rows: np.ndarray, placement: Placement) -> None:
+        """Place other episodes in some slots; the others keep their state."""
+        before, self._placement = self._placement, placement
+        try:
+            self._max_steps[rows] = self._prepare_slots(rows)
+        except Exception:
+            self._placement = before
+            raise
+        self._live[rows] = False
+
+    def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:
+        """Get ready for what ``_placement`` now has in some slots; returns their step budgets, int [n]."""
+        raise self._error("this environment cannot place single slots: leave slots out")
 
     def _place(self, placement: Placement) -> None:
         self._placement = placement
@@ -129,7 +191,8 @@ class SlotBatch(ABC):
         self._check_open()
         stale = ~self._live | self.done
         if stale.any():
-            self._arm(stale)
+            with self._stepping():
+                self._arm(stale)
             self._begin(stale)
         tasks, episodes = self._placement.task, self._placement.episode
         return ResetInfo(
@@ -155,6 +218,24 @@ class SlotBatch(ABC):
         """What each slot's policy is told at present; in SIMPLER, tasks in two halves have two instructions."""
         return tuple(self._instruction(slot) for slot in range(self.num_envs))
 
+    @property
+    def timings(self) -> Timings:
+        """Seconds spent so far in physics and in rendering images."""
+        return Timings(physics_s=self._physics_s, images_s=self._images_s())
+
+    def _images_s(self) -> float:
+        """Seconds spent rendering images."""
+        return 0.0
+
+    @contextmanager
+    def _stepping(self) -> Iterator[None]:
+        """Count the time spent inside as physics."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._physics_s += time.perf_counter() - started
+
     # -- stepping ------------------------------------------------------------------------------------------------------
 
     def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
@@ -178,7 +259,8 @@ class SlotBatch(ABC):
         targets, moves, errors = action_space.ee_poses(poses, self.num_envs)
         hold = action_space.hold_steps(hold_steps, self.num_envs)
         before = self._steps.copy()
-        reward, arrived = self._drive(targets, hold, moves)
+        with self._stepping():
+            reward, arrived = self._drive(targets, hold, moves)
         return self._control(
             EePoseControl,
             reward,
@@ -207,7 +289,8 @@ class SlotBatch(ABC):
         self._check_live()
         checked, errors = action_space.plan(plan, self.num_envs)
         before = self._steps.copy()
-        reward, arrived, ticks = self._follow(checked, max_misses)
+        with self._stepping():
+            reward, arrived, ticks = self._follow(checked, max_misses)
         return self._control(
             PlanControl,
             reward,
@@ -325,7 +408,8 @@ class SlotBatch(ABC):
             about.append(f"{int((~self.done).sum())} running, {int(self._success.sum())} successful")
         else:
             about.append("waiting for reset()")
-        tasks = ", ".join(dict.fromkeys(self._label(int(task)) for task in self._placement.task))
+        labels = list(dict.fromkeys(self._label(int(task)) for task in self._placement.task))
+        tasks = ", ".join(labels if len(labels) <= _LISTED else [*labels[:_LISTED], f"... ({len(labels)} in all)"])
         return f"<{type(self).__name__} {self.suite}, tasks {tasks}: {'; '.join(about)}>"
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:

@@ -75,7 +75,8 @@ class EpisodeSlots:
     def begin(self, mask: np.ndarray, episode: npt.ArrayLike | None = None) -> dict[str, np.ndarray]:
         """Begin the next or the given episode in some slots; the others continue. Returns their infos."""
         slots = np.flatnonzero(mask)
-        self.env.set_some_episodes(slots, self._next(slots) if episode is None else self._given(episode)[slots])
+        chosen = self._next(slots) if episode is None else self._given(episode)[slots].tolist()
+        self.env.set_episodes(episodes=chosen, slots=slots)
         info = self.env.reset()
         return {"episode_id": np.array(info.episode_id, object), "instruction": np.array(info.instruction, object)}
 

@@ -74,22 +74,6 @@ class LiberoEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def set_some_episodes(self, slots: Any, episodes: Any) -> None:
-        """Choose what some slots run next, of the task they have; ``reset`` begins it, and the others go on.
-
-        Args:
-            slots: their indices, or bool [B].
-            episodes: init state of each of them, or one for all.
-
-        Raises:
-            PlacementError: an episode that does not exist.
-        """
-        self._check_open()
-        chosen = self._placement.episode.copy()
-        chosen[slots] = episodes
-        self._placement = self._chosen(None, chosen)
-        self._live[slots] = False
-
     def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
         counts = {"num_tasks": len(self._sources), "num_episodes": NUM_EPISODES}
         indices = None if tasks is None else placing.task_indices(tasks, [source.name for source in self._sources])
@@ -97,15 +81,17 @@ class LiberoEnv(SlotBatch):
 
     def _prepare(self) -> np.ndarray:
         """Scenes, physics and goal tables for the current placement; what still fits is kept."""
-        indices = np.unique(self._placement.task)
-        problems = {int(i): self._sources[i].problem() for i in indices}
-        keys = list(dict.fromkeys(problem.scene_key() for problem in problems.values()))
+        keys = list(dict.fromkeys(self._sources[int(i)].problem().scene_key() for i in np.unique(self._placement.task)))
+        # Every task of the suite that shares a scene, so that a slot may change its task without another model.
+        every = {index: source.problem() for index, source in enumerate(self._sources)}
+        problems = {index: problem for index, problem in every.items() if problem.scene_key() in keys}
         scenes = [self._scene(key, problems, self.config.geometry) for key in keys]
         fixture_poses.check_names(self._rules.fixtures, scenes)
         self._tasks = {
             i: _TaskData(self._sources[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
         }
         scene_of_slot = np.array([self._tasks[int(task)].scene for task in self._placement.task])
+        self._scene_of_slot = scene_of_slot
         if self._physics is None or not self._physics.serves(scenes, scene_of_slot):
             self._close_physics()
             self._physics = make_physics(
@@ -119,6 +105,17 @@ class LiberoEnv(SlotBatch):
             )
         self._physics.set_goals([self._goal_table(group) for group in self._physics.groups])
         return np.full(self.num_envs, self._rules.max_steps)
+
+    def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:
+        for row in rows.tolist():
+            task = int(self._placement.task[row])
+            if task not in self._tasks or self._tasks[task].scene != self._scene_of_slot[row]:
+                raise LiberoError(
+                    f"{self.suite} task {task} ({self._sources[task].name}) is in another scene than slot {row}: "
+                    "while other slots continue, a slot changes to tasks of its own scene only"
+                )
+        self.physics.set_goals([self._goal_table(group) for group in self.physics.groups])
+        return np.full(len(rows), self._rules.max_steps)
 
     def _scene(self, key: SceneKey, problems: Mapping[int, Problem], geometry: str) -> Scene:
         """The scene of this key, for those of the problems that share it."""
@@ -145,7 +142,7 @@ class LiberoEnv(SlotBatch):
 
     def _goal_table(self, group: Group) -> goals.GoalTable:
         tasks = self._placement.task[group.slots]
-        present = [int(task) for task in np.unique(tasks)]
+        present = [task for task, data in self._tasks.items() if data.scene == self._tasks[int(tasks[0])].scene]
         rows = [present.index(int(task)) for task in tasks]
         return goals.build_table([self._tasks[task].problem for task in present], group.scene, rows)
 
@@ -199,8 +196,12 @@ class LiberoEnv(SlotBatch):
         chunk, sanitized = action_space.continuous(actions, self.num_envs)
         before = self._steps.copy()
         until = self._until_success
-        ran = self.physics.run(chunk, ~self.done, self._ticks_left, self._watchers, until_success=until)
+        with self._stepping():
+            ran = self.physics.run(chunk, ~self.done, self._ticks_left, self._watchers, until_success=until)
         return self._control(Control, self._book(ran.ticks, ran.success, ran.solved), before, sanitized)
+
+    def _images_s(self) -> float:
+        return self._cameras.seconds
 
     @property
     def _ticks_left(self) -> np.ndarray:
@@ -235,8 +236,11 @@ class LiberoEnv(SlotBatch):
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
         """Proprioception of every slot, and what its cameras see now; images are rendered when they are read.
+
+        Args:
+            slots: draw the images of these slots only, bool [B] or indices; those of the others are black. None: all.
 
         Reading one raises ``GlError`` where there is no GL, and ``SceneError`` or ``AssetsMissing`` where the meshes
         and textures are missing.
@@ -244,7 +248,7 @@ class LiberoEnv(SlotBatch):
         self._check_live()
         groups = self.physics.groups
         problems = [self._tasks[int(self._placement.task[group.slots[0]])].problem for group in groups]
-        seen = self._cameras.capture(groups, problems)
+        seen = self._cameras.capture(groups, problems, self.slot_indices(slots))
         return Egocentric(
             state=observe.proprioception(self.physics),
             images=seen.images,
@@ -266,7 +270,7 @@ class LiberoEnv(SlotBatch):
         self._check_open()
         self._cameras.options = options_of(options, self.num_envs)
 
-    def observe_objects(self, points: str = "surface") -> Objects:
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
         """Ground truth of every slot.
 
         Parts are those of upstream's collision geometry with lean geometry, too.
@@ -274,6 +278,7 @@ class LiberoEnv(SlotBatch):
         Args:
             points: ``"surface"``, true surface points of the collision geometry (at least 200 a thing, always the same
                 ones); or ``"aabb"``, points on the faces of the box around it.
+            slots: of these slots only, bool [B] or indices; the others have no snapshot. None: all.
 
         Raises:
             LiberoError: another value.
@@ -281,7 +286,9 @@ class LiberoEnv(SlotBatch):
         """
         self._check_live()
         problems = [self._tasks[int(task)].problem for task in self._placement.task]
-        return observe.objects(self.physics.groups, self._exact_scene, problems, self._fault, points)
+        return observe.objects(
+            self.physics.groups, self._exact_scene, problems, self._fault, points, self.slot_indices(slots)
+        )
 
     def check_success(self) -> np.ndarray:
         """Whether each slot's goal holds in its present state, bool [B]; unlike ``evaluate`` not tied to a tick."""

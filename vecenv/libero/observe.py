@@ -50,6 +50,7 @@ def objects(
     problems: Sequence[Problem],
     faults: Sequence[str],
     points: str,
+    slots: np.ndarray,
 ) -> Objects:
     """Ground truth of every slot.
 
@@ -59,6 +60,7 @@ def objects(
         problems: the problem of each slot, B.
         faults: why the physics of each slot failed, "" where it did not, B; a failed slot has no snapshot.
         points: ``"surface"`` or ``"aabb"``, see ``LiberoEnv.observe_objects``.
+        slots: indices of the slots to observe; the others have no snapshot.
 
     Raises:
         LiberoError: other ``points``.
@@ -66,13 +68,19 @@ def objects(
     if points not in ("surface", "aabb"):
         raise LiberoError(f"points={points!r}: expected 'surface' or 'aabb'")
     snapshots: list[ObjectsSnapshot | None] = [None] * len(problems)
+    wanted = np.isin(np.arange(len(problems)), slots)
     for group in groups:
+        rows = np.flatnonzero(wanted[group.slots])
+        if not len(rows):
+            continue
         group.refresh_kinematics()
         samples = _Clouds.of(group.scene, exact_scene(group))
-        clouds, parts = samples.world(group, points), samples.parts_in_world(group)
-        for row, slot in enumerate(group.slots):
+        clouds, parts = samples.world(group, rows, points), samples.parts_in_world(group, rows)
+        for index, row in enumerate(rows.tolist()):
+            slot = int(group.slots[row])
             if not faults[slot]:
-                snapshots[slot] = _snapshot(group, row, problems[slot], clouds, parts[row])
+                seen = {name: (pos[index], normal[index]) for name, (pos, normal) in clouds.items()}
+                snapshots[slot] = _snapshot(group, row, problems[slot], seen, parts[index])
     return Objects(
         snapshot=tuple(snapshots), error=tuple(f"physics failed: {reason}" if reason else "" for reason in faults)
     )
@@ -86,7 +94,7 @@ def _snapshot(
     parts: Mapping[str, Part],
 ) -> ObjectsSnapshot:
     scene = group.scene
-    named = {name: PointCloud(pos[row], normal[row]) for name, (pos, normal) in clouds.items()}
+    named = {name: PointCloud(pos, normal) for name, (pos, normal) in clouds.items()}
     scenery = named.pop(_SCENERY)
     everything = [*named.values(), scenery]
     return ObjectsSnapshot(
@@ -126,20 +134,22 @@ class _Clouds:
         corners = {name: surface.entity_corners(scene, name) for name in names}
         return _Clouds(points, corners, scene_parts(exact))
 
-    def world(self, group: Group, points: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        clouds = {name: cloud.world(group.xpos, group.xmat) for name, cloud in self.surface.items()}
+    def world(self, group: Group, rows: np.ndarray, points: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        xpos, xmat = group.xpos[rows], group.xmat[rows]
+        clouds = {name: cloud.world(xpos, xmat) for name, cloud in self.surface.items()}
         if points == "aabb":
             for name, corners in self.corners.items():
-                pos, _ = corners.world(group.xpos, group.xmat)
+                pos, _ = corners.world(xpos, xmat)
                 clouds[name] = surface.box_samples(pos.min(axis=1), pos.max(axis=1))
         return clouds
 
-    def parts_in_world(self, group: Group) -> list[dict[str, Part]]:
-        """The parts of each slot of a group."""
-        clouds = {name: spec.points.world(group.xpos, group.xmat) for name, spec in self.parts.items()}
+    def parts_in_world(self, group: Group, rows: np.ndarray) -> list[dict[str, Part]]:
+        """The parts of each of a group's rows."""
+        xpos, xmat = group.xpos[rows], group.xmat[rows]
+        clouds = {name: spec.points.world(xpos, xmat) for name, spec in self.parts.items()}
         return [
-            {name: _part(group, row, self.parts[name], pos[row], normal[row]) for name, (pos, normal) in clouds.items()}
-            for row in range(len(group.slots))
+            {name: _part(group, row, self.parts[name], pos[k], normal[k]) for name, (pos, normal) in clouds.items()}
+            for k, row in enumerate(rows.tolist())
         ]
 
 

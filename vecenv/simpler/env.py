@@ -12,6 +12,7 @@ An action is dx dy dz (metres), a rotation vector (radians), and the gripper, in
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -77,6 +78,7 @@ class SimplerEnv(SlotBatch):
         self._slots: Slots | None = make_slots(self._sizes(), self._num_workers())
         # Where objects of an episode came to rest; settling is the most expensive part of a reset.
         self._settled: dict[tuple[int, int], np.ndarray] = {}
+        self._drawing_s = 0.0
         self._prepared: dict[tuple[int, int], Episode] = {}
         self._camera_poses = CameraPoses(self.robot, self._root)
         self._place(placement)
@@ -90,25 +92,6 @@ class SimplerEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def set_some_episodes(self, slots: npt.ArrayLike, episodes: npt.ArrayLike) -> None:
-        """Choose what some slots run next, of the task they have; ``reset`` begins it, and the others continue.
-
-        Args:
-            slots: their indices, or bool [B].
-            episodes: episode of each of them, or one for all.
-
-        Raises:
-            PlacementError, PublishedError: an episode that does not exist.
-        """
-        self._check_open()
-        chosen = self._placement.episode.copy()
-        chosen[np.asarray(slots)] = episodes
-        self._placement = self._chosen(None, chosen)
-        for slot in np.arange(self.num_envs)[np.asarray(slots)]:
-            self._episodes[slot] = self._episode(*self._key(slot))
-            self._max_steps[slot] = self.config.max_steps or self._episodes[slot].task.max_steps
-        self._live[np.asarray(slots)] = False
-
     def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
         most = max(counts(self.config.protocol, self.suite).values())
         limits = {"num_tasks": len(self.tasks), "num_episodes": most}
@@ -121,6 +104,12 @@ class SimplerEnv(SlotBatch):
         self._judges: list[Judge | None] = [None] * self.num_envs
         self._verdicts = [Verdict(False)] * self.num_envs
         return np.array([self.config.max_steps or each.task.max_steps for each in self._episodes])
+
+    def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:
+        for row in rows.tolist():
+            self._episodes[row] = self._episode(*self._key(row))
+            self._judges[row], self._verdicts[row] = None, Verdict(False)
+        return np.array([self.config.max_steps or self._episodes[row].task.max_steps for row in rows.tolist()])
 
     def _episode(self, task: int, episode: int) -> Episode:
         key = (task, episode)
@@ -201,10 +190,11 @@ class SimplerEnv(SlotBatch):
         chunk[..., 6] = self._native_gripper(chunk[..., 6])
         self._servo.forget(np.ones(self.num_envs, bool))
         before, reward = self._steps.copy(), np.zeros(self.num_envs)
-        for tick in range(chunk.shape[1]):
-            if self.done.all():
-                break
-            reward += self._tick(chunk[:, tick], ~self.done)
+        with self._stepping():
+            for tick in range(chunk.shape[1]):
+                if self.done.all():
+                    break
+                reward += self._tick(chunk[:, tick], ~self.done)
         return self._control(Control, reward, before, sanitized)
 
     def _native_gripper(self, values: np.ndarray) -> np.ndarray:
@@ -260,8 +250,11 @@ class SimplerEnv(SlotBatch):
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
         """What every slot's camera sees now, and its joints; images are rendered when they are first read.
+
+        Args:
+            slots: draw these slots only, bool [B] or indices; the images of the others are black. None: all.
 
         ``state`` is qpos, qvel and base pose (xyz, wxyz), float32 [B, 23] or [B, 29]. The only camera is the
         third-person one, 480 x 640 or 512 x 640; ``wrist_image`` is None. A slot whose physics failed shows black.
@@ -269,7 +262,7 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         facts = self._facts.copy()
         state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
-        healthy = [slot for slot, fault in enumerate(self._fault) if not fault]
+        healthy = [slot for slot in self.slot_indices(slots).tolist() if not self._fault[slot]]
         images = LazyImages(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
         cameras = [episode.task.camera for episode in self._episodes]
         return SimplerEgocentric(
@@ -286,13 +279,21 @@ class SimplerEnv(SlotBatch):
         style = RenderStyle(overlay=self.config.overlay, shadows=self.config.shadows)
         buffer = ImageBuffer(slots=self.num_envs, height=camera.height, width=camera.width, deep=deep)
         subjects = {slot: (RenderSubject.of(episode, self._root), facts) for slot, (episode, facts) in slots.items()}
-        return self.slots.draw(style, buffer, subjects)
+        started = time.perf_counter()
+        try:
+            return self.slots.draw(style, buffer, subjects)
+        finally:
+            self._drawing_s += time.perf_counter() - started
 
-    def observe_objects(self, points: str = "surface") -> Objects:
+    def _images_s(self) -> float:
+        return self._drawing_s
+
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
         """Ground truth of every slot.
 
         Args:
             points: ``"surface"``, points on the collision meshes; or ``"aabb"``, on the faces of the box around them.
+            slots: of these slots only, bool [B] or indices; the others have no snapshot. None: all.
 
         Raises:
             SimplerError: another value.
@@ -300,10 +301,12 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         if points not in ("surface", "aabb"):
             raise SimplerError(f"points={points!r}: expected 'surface' or 'aabb'")
+        wanted = np.isin(np.arange(self.num_envs), self.slot_indices(slots))
+        rows = zip(wanted, self._episodes, self._facts, self._fault, strict=True)
         return Objects(
             snapshot=tuple(
-                None if fault else snapshot.take(episode, facts, points)
-                for episode, facts, fault in zip(self._episodes, self._facts, self._fault, strict=True)
+                snapshot.take(episode, facts, points) if asked and not fault else None
+                for asked, episode, facts, fault in rows
             ),
             error=tuple(f"physics failed: {reason}" if reason else "" for reason in self._fault),
         )

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vecenv.controllers.waypoint import Plan
+from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.simpler.control.servo import Servo
 
 
@@ -27,7 +27,7 @@ class PlanFollower:
         ticks: control ticks that each waypoint took, [B, T].
     """
 
-    def __init__(self, servo: Servo, plan: Plan, max_misses: int | None) -> None:
+    def __init__(self, servo: Servo, plan: WaypointPlan, max_misses: int | None) -> None:
         self._servo, self._max_misses = servo, max_misses
         self._targets = np.concatenate([plan.pose.pos, plan.pose.quat, np.asarray(plan.grip)[..., None]], axis=-1)
         self._hold, self._valid = np.asarray(plan.hold), np.asarray(plan.valid)

@@ -63,6 +63,34 @@ class Reporting(Protocol):
         ...
 
 
+@runtime_checkable
+class Refillable(Protocol):
+    """A policy whose slots may begin new episodes one by one; optional.
+
+    With it, a slot whose episode has ended takes the next one at once. Without it, the harness waits until every slot
+    has finished, and calls ``reset`` for the next batch.
+    """
+
+    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
+        """Begin new episodes in some slots, while the others continue theirs.
+
+        Args:
+            env: the environment, in which the slots were just reset.
+            info: what its reset returned, for all slots.
+            slots: indices of the slots that begin, ascending.
+        """
+        ...
+
+
+@runtime_checkable
+class Ending(Protocol):
+    """A policy that learns how episodes end, to log or to learn; optional."""
+
+    def episode_end(self, slot: int, record: Mapping[str, Any]) -> None:
+        """An episode has ended: its slot, and its record (``vecenv_eval.store.Record``) as plain values."""
+        ...
+
+
 def extras_of(policy: Policy, slot: int) -> dict[str, Any]:
     """What a policy reports about the episode in a slot; nothing if it reports nothing."""
     return dict(policy.extras(slot)) if isinstance(policy, Reporting) else {}

@@ -26,6 +26,9 @@ class ZeroPolicy:
         del info
         self._actions = np.tile(self._action, (env.num_envs, 1))
 
+    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
+        """Nothing to begin: every episode has the same actions."""
+
     def act(self, env: BatchEnv) -> np.ndarray:
         """The same action for every slot, [B, 7]."""
         del env

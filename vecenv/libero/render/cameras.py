@@ -8,9 +8,11 @@ drawn before an image is read, and no GL library is loaded before that.
 from __future__ import annotations
 
 import threading
+import time
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -61,6 +63,9 @@ class CameraRig:
     Args:
         config: how to render.
         num_envs: slots, B.
+
+    Attributes:
+        seconds: time spent rendering so far.
     """
 
     def __init__(self, config: RenderConfig, num_envs: int) -> None:
@@ -70,10 +75,20 @@ class CameraRig:
         self._rays: RayRenderer | None = None
         self._stages: list[Stage] = []
         self._closed = False
+        self.seconds = 0.0
 
-    def capture(self, groups: Sequence[Group], problems: Sequence[Problem]) -> Capture:
-        """Capture the poses of now; ``problems`` has one for each group."""
-        return Capture(self, groups, problems)
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Add the time spent inside to ``seconds``."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds += time.perf_counter() - started
+
+    def capture(self, groups: Sequence[Group], problems: Sequence[Problem], slots: np.ndarray) -> Capture:
+        """Capture the poses of now; ``problems`` has one for each group, ``slots`` the indices of those to draw."""
+        return Capture(self, groups, problems, slots)
 
     def stages(self, problems: Sequence[Problem], models: Sequence[mujoco.MjModel]) -> list[Stage]:
         """The stages of these problems, one physics model for each; they are kept until others are requested.
@@ -131,7 +146,7 @@ class CameraRig:
 
 
 class Capture:
-    """The images of a batch at one moment.
+    """The images of a batch at one moment; those of slots that were not asked for are 0 everywhere.
 
     Attributes:
         images: uint8 [B, H, W, 3] by camera, rendered when read; so are all mappings here.
@@ -141,8 +156,8 @@ class Capture:
         instances: by slot, the names that segmentation images index.
     """
 
-    def __init__(self, rig: CameraRig, groups: Sequence[Group], problems: Sequence[Problem]) -> None:
-        self._rig, self._problems = rig, tuple(problems)
+    def __init__(self, rig: CameraRig, groups: Sequence[Group], problems: Sequence[Problem], slots: np.ndarray) -> None:
+        self._rig, self._problems, self._drawn = rig, tuple(problems), slots
         self._models = [group.scene.model for group in groups]
         count = sum(len(group.slots) for group in groups)
         shots: dict[int, Shot] = {}
@@ -167,13 +182,30 @@ class Capture:
         self, wanted: Wanted, pick: Callable[[Frames], Mapping[str, np.ndarray]]
     ) -> Callable[[Sequence[str]], Mapping[str, np.ndarray]]:
         def render(names: Sequence[str]) -> Mapping[str, np.ndarray]:
-            if self._rig.config.engine == "raytrace":
-                rays = self._rig.rays()
-                return pick(rays.render(self._shots, self._problems, self._models, names, wanted))
-            renderer = self._rig.renderer(self._rig.stages(self._problems, self._models))
-            return pick(renderer.render(self._shots, self._cameras(names), wanted))
+            with self._rig.timed():
+                return self._of_all_slots(pick(self._frames(names, wanted)))
 
         return render
+
+    def _frames(self, names: Sequence[str], wanted: Wanted) -> Frames:
+        """Images of the drawn slots alone, in their order, and of none twice but on the ray tracer."""
+        shots = [self._shots[slot] for slot in self._drawn]
+        if self._rig.config.engine == "raytrace":
+            # A compiled program draws one number of slots: powers of two keep the programs few.
+            shots += shots[:1] * (min(1 << (len(shots) - 1).bit_length(), len(self._shots)) - len(shots))
+            return self._rig.rays().render(shots, self._problems, self._models, names, wanted)
+        renderer = self._rig.renderer(self._rig.stages(self._problems, self._models))
+        return renderer.render(shots, self._cameras(names), wanted)
+
+    def _of_all_slots(self, images: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """Images [B, ...] from those of the drawn slots."""
+        count, drawn = len(self._shots), len(self._drawn)
+        if drawn == count:
+            return images
+        every = {name: np.zeros((count, *array.shape[1:]), array.dtype) for name, array in images.items()}
+        for name, array in images.items():
+            every[name][self._drawn] = array[:drawn]
+        return every
 
     def _views(self, names: Sequence[str]) -> dict[str, CameraView]:
         stages, config = self._rig.stages(self._problems, self._models), self._rig.config

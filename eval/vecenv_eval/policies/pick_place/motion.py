@@ -112,6 +112,13 @@ class WaypointFollower:
             self._numbers[slot, t] = waypoint.grip, *tolerances, waits, waypoint.speed
         self._begin(np.arange(self.num_envs) == slot)
 
+    def clear(self, slots: np.ndarray) -> None:
+        """Forget the plans of ``slots``, indices: they begin new episodes, gripper open."""
+        for table in (self.length, self.cursor, self._opening, self._still):
+            table[slots] = 0
+        self._grip[slots] = OPEN
+        self._begin(np.isin(np.arange(self.num_envs), slots))
+
     def act(self, state: np.ndarray) -> np.ndarray:
         """Actions of this tick.
 

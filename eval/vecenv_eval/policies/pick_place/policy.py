@@ -103,7 +103,7 @@ class PickPlacePolicy:
         self.config = config or PickPlaceConfig()
         self._slots: list[_Slot] = []
         self._follower = WaypointFollower(0, self.config.motion)
-        self._tick = 0
+        self._ticks = np.zeros(0, int)
         self._base = np.zeros((0, 2))
 
     @property
@@ -116,17 +116,33 @@ class PickPlacePolicy:
         del info
         self._slots = [_Slot() for _ in range(env.num_envs)]
         self._follower = WaypointFollower(env.num_envs, self.config.motion)
-        self._tick = 0
-        self._base = env.observe_egocentric().state[:, :2].astype(float) - self.config.home_reach * np.array([1.0, 0.0])
-        self._plan(env, np.ones(env.num_envs, bool))
+        self._ticks = np.zeros(env.num_envs, int)
+        self._base = np.zeros((env.num_envs, 2))
+        self._begin_slots(env, np.arange(env.num_envs))
+
+    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
+        """Likewise for the slots that begin."""
+        del info
+        for slot in slots.tolist():
+            self._slots[slot] = _Slot()
+        self._follower.clear(slots)
+        self._ticks[slots] = 0
+        self._begin_slots(env, slots)
+
+    def _begin_slots(self, env: BatchEnv, slots: np.ndarray) -> None:
+        hand = env.observe_egocentric().state[slots, :2].astype(float)
+        self._base[slots] = hand - self.config.home_reach * np.array([1.0, 0.0])
+        self._plan(env, np.isin(np.arange(env.num_envs), slots))
 
     def act(self, env: BatchEnv) -> np.ndarray:
         """Actions of this tick, [B, 7]."""
-        if self._tick % self.config.plan_every == 1 and self._follower.finished.any():
-            waiting = self._follower.finished & ~self._settled(env)
+        # Every slot counts its own ticks, so that its plans do not depend on the batch around it.
+        waiting = self._follower.finished & (self._ticks % self.config.plan_every == 1)
+        if waiting.any():
+            waiting &= ~self._settled(env)
             if waiting.any():
                 self._plan(env, waiting)
-        self._tick += 1
+        self._ticks += 1
         return self._follower.act(env.observe_egocentric().state)
 
     def _settled(self, env: BatchEnv) -> np.ndarray:
@@ -134,7 +150,7 @@ class PickPlacePolicy:
         return env.evaluate().success | np.array([bool(slot.done) for slot in self._slots])
 
     def _plan(self, env: BatchEnv, waiting: np.ndarray) -> None:
-        snapshots = env.observe_objects().snapshot
+        snapshots = env.observe_objects(slots=waiting).snapshot
         for i in np.flatnonzero(waiting):
             snapshot, slot = snapshots[i], self._slots[i]
             if snapshot is None:

@@ -57,6 +57,12 @@ class SimplerScriptedPolicy:
         self._arm = Arm(env.robot, env.config.assets or assets.simpler_root())
         self._slots = [_Slot() for _ in range(env.num_envs)]
 
+    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
+        """Begin from nothing in the slots that begin."""
+        del env, info
+        for slot in slots.tolist():
+            self._slots[slot] = _Slot()
+
     def act(self, env: BatchEnv) -> Control:
         """The next few waypoints of every slot, followed to their end."""
         plans = [self._next(slot, look) for slot, look in zip(self._slots, self._looks(env), strict=True)]
