@@ -166,6 +166,18 @@ def test_what_a_caller_gets_does_not_change_with_the_batch(env: Scripted) -> Non
     assert not metrics.success.any()
 
 
+def test_episodes_that_are_ended_ignore_steps_until_reset() -> None:
+    env = Scripted(3)
+    env.reset()
+    env.tick(success=(2,))
+    env.end_episodes([1, 2])
+    control = env.tick()
+    assert control.step_index.tolist() == [2, 1, 1]
+    assert (control.truncated.tolist(), control.terminated.tolist()) == ([False, True, False], [False, False, True])
+    env.reset()
+    assert env.armed[-1] == [1, 2]
+
+
 # -- the object --------------------------------------------------------------------------------------------------------
 
 

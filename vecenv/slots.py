@@ -214,6 +214,19 @@ class SlotBatch(ABC):
         self._live |= stale
         self._quarantine(stale)
 
+    def end_episodes(self, slots: Any) -> None:
+        """End the episodes of some slots: truncated, they ignore further steps and cost nothing until ``reset``.
+
+        Args:
+            slots: bool [B] or indices.
+
+        Raises:
+            PlacementError: a mask of another length, or a slot that does not exist.
+        """
+        self._check_live()
+        rows = self.slot_indices(slots)
+        self._truncated[rows] |= ~self._terminated[rows]
+
     def instructions(self) -> tuple[str, ...]:
         """What each slot's policy is told at present; in SIMPLER, tasks in two halves have two instructions."""
         return tuple(self._instruction(slot) for slot in range(self.num_envs))
