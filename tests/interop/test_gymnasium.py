@@ -50,7 +50,7 @@ def episodes(infos: Mapping[str, Any]) -> list[int | None]:
     return [None if name is None else int(name.rsplit("/", 1)[1]) for name in infos["episode_id"]]
 
 
-def solve(batch: LiberoEnv, slots: Sequence[int]) -> None:
+def solve(batch: Any, slots: Sequence[int]) -> None:
     """Overwrite the state so that the target object floats just above the floor of the basket."""
     state, snapshots = batch.state(), batch.observe_objects().snapshot
     for slot in slots:
@@ -312,8 +312,9 @@ def test_observations_say_where_things_are() -> None:
 
 def test_drawers_are_observed() -> None:
     env = Env("libero_goal", task=0, episodes=[0], obs="objects")
-    seen, _ = env.reset()
-    (group,) = env.batch.physics.groups
+    seen: Any = env.reset()[0]
+    batch: Any = env.batch
+    (group,) = batch.physics.groups
     joints = [group.scene.model.joint(joint).qposadr[0] for entity in group.scene.fixtures for joint in entity.joints]
     assert joints
     np.testing.assert_allclose(seen[env.layout["fixture_joints"]], group.qpos[0, joints], atol=1e-6)

@@ -67,7 +67,7 @@ def test_observations_are_what_preprocess_observation_takes(env: LeRobotVectorEn
     state: Any = seen["agent_pos"]
     assert (state.shape, state.dtype.name) == ((COUNT, 8), "float32")
     assert infos["is_success"].tolist() == [False, False]
-    np.testing.assert_array_equal(np.stack(env.call("render")), pixels["image"])
+    np.testing.assert_array_equal(np.stack(env.render()), pixels["image"])
     assert env.call("task_description") == ("pick up the cream cheese and place it in the basket",) * COUNT
     assert env.call("task") == ("pick_up_the_cream_cheese_and_place_it_in_the_basket",) * COUNT
     assert env.unwrapped.metadata["render_fps"] == 20
@@ -87,7 +87,7 @@ def test_an_episode_that_ended_stays_as_it_is_and_success_is_in_the_infos(env: L
     later, reward, terminated, truncated, infos = env.step(zeros())
     assert (reward.tolist(), terminated.tolist(), truncated.tolist()) == ([0, 0], [True, False], [False, True])
     assert infos["is_success"].tolist() == [True, False]
-    before, after = solved["agent_pos"], later["agent_pos"]
+    before, after = np.asarray(solved["agent_pos"]), np.asarray(later["agent_pos"])
     np.testing.assert_array_equal(before[0], after[0])
 
 
@@ -105,8 +105,9 @@ def test_simplers_tasks_have_their_own_camera_and_rate(small: Path) -> None:
     pytest.importorskip("sapien")
     fields = {"assets": small, "num_threads": 1}
     env = make_envs("simpler/bridge", num_envs=1, tasks=[0], options=LeRobotOptions(fields=fields))["simpler/bridge"][0]
-    assert {name: box.shape for name, box in env.single_observation_space["pixels"].items()} == {"image": (480, 640, 3)}
-    assert env.single_observation_space["agent_pos"].shape == (23,)
+    space: Any = env.single_observation_space
+    assert {name: box.shape for name, box in space["pixels"].items()} == {"image": (480, 640, 3)}
+    assert space["agent_pos"].shape == (23,)
     assert (env.call("_max_episode_steps"), env.metadata["render_fps"]) == ((60,), 5)
 
 

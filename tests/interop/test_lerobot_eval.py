@@ -6,6 +6,8 @@ Needs LeRobot (Python 3.12) and ``packages/lerobot_env_vecenv`` installed, other
     pytest tests/interop/test_lerobot_eval.py
 """
 
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import json

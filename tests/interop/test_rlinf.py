@@ -64,6 +64,7 @@ def solve(env: RLinfEnv, slot: int) -> None:
 
 def test_observations_have_rlinfs_keys_shapes_and_types(env: RLinfEnv) -> None:
     assert env.is_start
+    obs: Any
     obs, infos = env.reset()
     assert not env.is_start
     assert infos == {}

@@ -6,7 +6,7 @@ In: a batch and the episodes its slots go through. Out: starts, ticks, and what 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -115,7 +115,7 @@ def num_episodes(suite: str, protocol: str) -> tuple[int, ...]:
     return (counts,) * tasks if isinstance(counts, int) else tuple(int(count) for count in counts)
 
 
-def check_options(options: Mapping[str, object] | None, known: tuple[str, ...]) -> Mapping[str, object]:
+def check_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> Mapping[str, Any]:
     """Options of ``reset``.
 
     Raises:

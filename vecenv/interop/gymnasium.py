@@ -240,7 +240,7 @@ def _infos(said: Mapping[str, np.ndarray], mask: np.ndarray) -> Infos:
 def _separate(observations: Observation, mask: np.ndarray) -> np.ndarray:
     """Observations of single sub-environments where the mask holds and None elsewhere, object [B]."""
     out = np.full(len(mask), None, object)
-    for slot in np.flatnonzero(mask):
+    for slot in np.flatnonzero(mask).tolist():
         out[slot] = _row(observations, slot)
     return out
 

@@ -132,7 +132,9 @@ class LeRobotVectorEnv(gymnasium.vector.VectorEnv[LeRobotObservation, np.ndarray
         return int(config.max_steps or task.max_steps)
 
     def _space(self) -> spaces.Dict:
-        images = {name: spaces.Box(0, 255, shape, np.uint8) for name, shape in self._image_shapes().items()}
+        images: dict[str, spaces.Space[Any]] = {
+            name: spaces.Box(0, 255, shape, np.uint8) for name, shape in self._image_shapes().items()
+        }
         parts: dict[str, spaces.Space] = {"pixels": spaces.Dict(images)}
         if self.options.obs_type == "pixels_agent_pos":
             parts["agent_pos"] = spaces.Box(-np.inf, np.inf, (state_width(self.suite),), np.float32)

@@ -7,7 +7,7 @@ the slot as first axis.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 Batch: TypeAlias = "LiberoEnv | SimplerEnv"
 Observation: TypeAlias = "np.ndarray | dict[str, np.ndarray]"
-ObservationSpace: TypeAlias = "spaces.Box | spaces.Dict"
 
 OBSERVATIONS = ("pixels", "state", "proprio", "objects")
 """What can be observed: camera images, proprioception (under either name), and poses of all objects and fixtures."""
@@ -67,7 +66,7 @@ class Observer:
         boxes: dict[str, spaces.Space] = {}
         for name in names:
             boxes |= self._boxes(name)
-        self.space: ObservationSpace = self._box(names[0]) if self._plain else spaces.Dict(boxes)
+        self.space: spaces.Space[Any] = self._box(names[0]) if self._plain else spaces.Dict(boxes)
 
     def __call__(self) -> Observation:
         """The present observation of every slot."""

@@ -27,7 +27,7 @@ from vecenv.interop.reset_states import ResetStates
 from vecenv.interop.scattered import ScatteredBatch
 
 try:
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise MissingDependency("vecenv.interop.rlinf returns torch tensors: pip install torch", name="torch") from error
 
@@ -216,7 +216,7 @@ class RLinfEnv:
         return self._observe(), {}
 
     def step(
-        self, actions: torch.Tensor | npt.ArrayLike, auto_reset: bool = True
+        self, actions: torch.Tensor | np.ndarray, auto_reset: bool = True
     ) -> tuple[RLinfObs, torch.Tensor, torch.Tensor, torch.Tensor, RLinfInfos]:
         """Advance all environments by one tick, 50 ms.
 
@@ -228,7 +228,7 @@ class RLinfEnv:
             Observation, rewards float32 [B], terminations and truncations bool [B], and infos, whose ``episode`` has
             the metrics. An environment whose physics failed is truncated.
         """
-        given = actions.detach().cpu().numpy() if isinstance(actions, torch.Tensor) else np.asarray(actions, float)
+        given = actions if isinstance(actions, np.ndarray) else actions.detach().cpu().numpy()
         self._elapsed_steps += 1
         solved, failed = self.batch.step(given.reshape(self.num_envs, ACTION_DIM))
         truncated = (self._elapsed_steps >= self.max_episode_steps) | failed
