@@ -387,12 +387,14 @@ def test_images_and_proprioception_come_in_one_dictionary() -> None:
 
 def test_cameras_can_be_chosen_and_others_are_refused_with_those_there_are() -> None:
     eye = UserCamera.looking_at("side", (1.0, 0.5, 1.5), (0.0, 0.0, 1.0))
-    envs = make_vec(SUITE, obs="pixels", cameras=["side"], **{**SMALL, "render": {**SMALL["render"], "cameras": [eye]}})
+    envs = make_vec(
+        SUITE, obs="pixels", cameras=["side", "birdview"], **{**SMALL, "render": {**SMALL["render"], "cameras": [eye]}}
+    )
     observations, _ = envs.reset()
     assert observations in envs.observation_space
-    assert list(observations) == ["side"]
+    assert set(observations) == {"side", "birdview"}
     envs.close()
-    with pytest.raises(GymnasiumError, match="agentview, wrist"):
+    with pytest.raises(GymnasiumError, match="agentview, wrist, birdview"):
         Env(SUITE, obs="pixels", cameras=["front"], **SMALL)
 
 

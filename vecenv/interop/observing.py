@@ -136,7 +136,8 @@ def _image_shapes(env: Batch) -> dict[str, tuple[int, int]]:
     if isinstance(env, LiberoEnv):
         render = vecenv.RenderConfig() if env.config.render is None else env.config.render
         assert isinstance(render, vecenv.RenderConfig)
-        names = (*POLICY_CAMERAS, *(camera.name for camera in render.cameras))
+        in_scene = [{model.camera(index).name for index in range(model.ncam)} for model in env.mj_models]
+        names = (*POLICY_CAMERAS, *(camera.name for camera in render.cameras), *sorted(set.intersection(*in_scene)))
         return dict.fromkeys(names, (render.height, render.width))
     camera = env.tasks[int(env.placement.task[0])].camera
     return {POLICY_CAMERAS[0]: (camera.height, camera.width)}
