@@ -1,18 +1,18 @@
-# Everything here starts from an empty clone: each target sets up what it needs, says so, and does it once.
+# Every target works in an empty clone: it sets up what it needs, prints that, and does it once.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
 
 VENV ?= .venv
-# Any Python from 3.11 on; looked for when not given.
+# Any Python from 3.11 on; searched for when empty.
 PYTHON ?=
-# What `make eval` evaluates.
+# Arguments of `make eval`.
 EVAL_ARGS ?= --suite libero_object --policy pick_place --episodes 5
 # Test processes; each compiles its own JAX functions and takes about 1 GB.
 WORKERS ?= 2
-# What `make system` does: install, or dry to print the commands.
+# `make system`: install, or dry to only print the commands.
 SYSTEM ?= install
-# More arguments for pytest, say TEST_ARGS="tests/test_cli.py -k doctor".
+# More arguments for pytest, for example TEST_ARGS="tests/test_cli.py -k doctor".
 TEST_ARGS ?=
 
 RUN := $(VENV)/bin
@@ -23,9 +23,9 @@ PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: $(VENV)/.installed-dev ## Make .venv and install vecenv in it with everything for development
+setup: $(VENV)/.installed-dev ## Make .venv and install vecenv in it for development
 
-system: ## Install what pictures need of the system (GL, Vulkan), where apt and root are there; else print how
+system: ## Install the system libraries for images (GL, Vulkan) with apt as root; otherwise print the commands
 	@scripts/system.sh $(SYSTEM)
 
 eval: $(VENV)/.installed-eval ## Evaluate pick_place on libero_object: 10 tasks x 5 episodes, table and results folder
@@ -33,7 +33,7 @@ eval: $(VENV)/.installed-eval ## Evaluate pick_place on libero_object: 10 tasks 
 	@echo "==> vecenv eval $(EVAL_ARGS)"
 	@$(RUN)/vecenv eval $(EVAL_ARGS)
 
-test: $(VENV)/.installed-dev ## Run the tests, all but those marked heavy
+test: $(VENV)/.installed-dev ## Run the tests that are not marked heavy
 	@scripts/system.sh release
 	@echo "==> pytest, $(WORKERS) processes, without the tests marked heavy"
 	@$(PYTEST) -m "not heavy" $(TEST_ARGS)
@@ -42,7 +42,7 @@ test-heavy: $(VENV)/.installed-dev ## Run the tests marked heavy (minutes of phy
 	@echo "==> pytest, $(WORKERS) processes, the tests marked heavy"
 	@$(PYTEST) -m heavy $(TEST_ARGS)
 
-upstream: $(VENV)-upstream/.installed ## Make a venv with upstream's LIBERO under MuJoCo 3.3.0, the peer of published contacts and colours
+upstream: $(VENV)-upstream/.installed ## Make a venv with upstream's LIBERO under MuJoCo 3.3.0, for comparisons
 
 parity: $(VENV)/.installed-dev upstream ## Regenerate the tables of docs/fidelity.md against upstream (about two hours on 2 cores)
 	$(RUN)/python benchmarks/trajectories.py
@@ -74,14 +74,14 @@ lint: $(VENV)/.installed-dev ## Check style, formatting, imports and types: ruff
 	@echo "==> pyright"
 	@$(RUN)/pyright
 
-format: $(VENV)/.installed-dev ## Put the formatting right, and what ruff can mend by itself
+format: $(VENV)/.installed-dev ## Format the code and apply ruff's automatic fixes
 	@$(RUN)/ruff check --fix-only
 	@$(RUN)/ruff format
 
-doctor: $(VENV)/.installed-eval ## Show what this machine has and what is missing
+doctor: $(VENV)/.installed-eval ## Show what is installed on this machine and what is missing
 	@$(RUN)/vecenv doctor
 
-dist-check: $(VENV)/.installed-dev ## Build the wheel, install it in a throw-away venv and try it there
+dist-check: $(VENV)/.installed-dev ## Build the wheel, install it in a temporary venv and test it there
 	@scripts/dist_check.sh $(RUN)/python
 
 clean: ## Remove caches and build outputs; .venv and results/ stay
@@ -91,11 +91,11 @@ clean: ## Remove caches and build outputs; .venv and results/ stay
 distclean: clean ## Remove .venv as well
 	rm -rf $(VENV)
 
-# A stamp for each set of extras; made again when pyproject.toml changes.
+# A stamp file for each set of extras; renewed when pyproject.toml changes.
 $(VENV)/.installed-%: pyproject.toml scripts/setup.sh
 	@PYTHON="$(PYTHON)" scripts/setup.sh $(VENV) $*
 
-# MuJoCo 3.3.0 gives the contacts and images that LIBERO's data and checkpoints were made with.
+# LIBERO's data and checkpoints were made with the contacts and images of MuJoCo 3.3.0.
 UPSTREAM_MUJOCO ?= 3.3.0
 $(VENV)-upstream/.installed:
 	@echo "==> $(VENV)-upstream: upstream's LIBERO under mujoco $(UPSTREAM_MUJOCO)"

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The system libraries that pictures need: GL (EGL, OSMesa) for LIBERO's, Vulkan for SIMPLER's. Physics needs none.
+# The system libraries that images need: GL (EGL, OSMesa) for LIBERO's, Vulkan for SIMPLER's. Physics needs none.
 # Usage: scripts/system.sh install | dry | check | release
 #   install  install what is missing, where this is root on Debian or Ubuntu; else print the commands
 #   dry      print the commands
@@ -56,13 +56,13 @@ fi
 
 missing="${plain[*]:-}${mesa:+ $mesa (Mesa $needed or newer)}"
 if [[ $mode == check ]]; then
-  echo "==> pictures lack system libraries: ${missing# }"
+  echo "==> missing system libraries for images: ${missing# }"
   echo "    physics runs without; 'make system' installs them, 'make doctor' says what works"
   exit 0
 fi
 
 if ! command -v apt-get >/dev/null; then
-  echo "==> this is not Debian or Ubuntu; what pictures need is called there: ${missing# }" >&2
+  echo "==> this is not Debian or Ubuntu; install the equivalents of: ${missing# }" >&2
   exit 1
 fi
 
@@ -86,7 +86,7 @@ if [[ -n $mesa ]]; then
     fi
     wanted_backports=$mesa
   else
-    note="the newest $mesa here is ${offered:-none}: SIMPLER's pictures need $needed, so a GPU's driver or a newer release"
+    note="the newest $mesa here is ${offered:-none}: SIMPLER's images need $needed, so a GPU's driver or a newer release"
   fi
 fi
 [[ ${#wanted[@]} -eq 0 ]] || commands+=("$apt ${wanted[*]}")

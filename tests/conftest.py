@@ -15,9 +15,11 @@ from support import checker
 # are modules that numba compiles, and dataclasses that JAX fills with things other than arrays while it traces.
 _CONTROLLERS = ("_batch_last", "chain", "gripper", "interpolate", "joint", "kinematics", "osc", "waypoint")
 _FUNCTIONAL = ("config", "env", "objectives", "observer", "physics", "randomize", "starts")
+_PLANNING = ("config", "maps", "plan", "planner", "push")
 _CHECKED = [
     *(f"vecenv.controllers.{name}" for name in _CONTROLLERS),
     *(f"vecenv.libero.functional.{name}" for name in _FUNCTIONAL),
+    *(f"voxposer.planning.{name}" for name in _PLANNING),
 ]
 jaxtyping.install_import_hook(_CHECKED, f"{checker.__name__}.{checker.check.__name__}")
 

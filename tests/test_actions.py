@@ -32,10 +32,10 @@ POSES = hnp.arrays(np.float64, (3, 8), elements=NUMBER)
 
 def test_one_action_a_slot_is_a_chunk_of_one() -> None:
     value = np.linspace(-1, 1, 14).reshape(2, 7)
-    actions, mended = continuous(value, 2)
+    actions, sanitized = continuous(value, 2)
     np.testing.assert_array_equal(actions, value[:, None])
     assert actions.dtype == np.float64
-    assert mended.tolist() == [False, False]
+    assert sanitized.tolist() == [False, False]
 
 
 def test_a_chunk_keeps_its_length() -> None:
@@ -53,14 +53,14 @@ def test_arrays_lists_and_json_text_are_the_same(form: Any) -> None:
     np.testing.assert_array_equal(continuous(form(value), 2)[0][:, 0], value)
 
 
-def test_not_finite_becomes_zero_and_too_large_is_clipped_and_the_slot_is_told() -> None:
+def test_not_finite_becomes_zero_and_too_large_is_clipped_and_the_slot_is_marked() -> None:
     value = np.zeros((3, 2, 7))
     value[0, 1, :5] = [np.nan, np.inf, -np.inf, 1.5, -7.0]
     value[1, 0, :2] = [1.0, -1.0]
-    actions, mended = continuous(value, 3)
+    actions, sanitized = continuous(value, 3)
     np.testing.assert_array_equal(actions[0, 1, :5], [0, 0, 0, 1, -1])
     np.testing.assert_array_equal(actions[1:], value[1:])
-    assert mended.tolist() == [True, False, False]
+    assert sanitized.tolist() == [True, False, False]
 
 
 def test_the_callers_array_is_left_alone() -> None:
@@ -70,9 +70,9 @@ def test_the_callers_array_is_left_alone() -> None:
 
 
 def test_json_text_may_hold_nan() -> None:
-    actions, mended = continuous("[[NaN, Infinity, 0, 0, 0, 0, 1]]", 1)
+    actions, sanitized = continuous("[[NaN, Infinity, 0, 0, 0, 0, 1]]", 1)
     assert actions[0, 0].tolist() == [0, 0, 0, 0, 0, 0, 1]
-    assert mended[0]
+    assert sanitized[0]
 
 
 @pytest.mark.parametrize(
@@ -103,22 +103,22 @@ def test_what_is_no_action_is_refused(value: Any, message: str) -> None:
 @given(JUNK, st.integers(1, 3))
 def test_whatever_comes_is_refused_or_valid(value: Any, num_envs: int) -> None:
     try:
-        actions, mended = continuous(value, num_envs)
+        actions, sanitized = continuous(value, num_envs)
     except ActionError:
         return
     assert actions.dtype == np.float64
     assert actions.shape[::2] == (num_envs, 7)
     assert (np.abs(actions) <= 1).all()
-    assert mended.shape == (num_envs,)
-    assert mended.dtype == bool
+    assert sanitized.shape == (num_envs,)
+    assert sanitized.dtype == bool
 
 
 @given(hnp.arrays(np.float64, (2, 3, 7), elements=NUMBER))
 def test_only_what_was_wrong_changes(value: np.ndarray) -> None:
-    actions, mended = continuous(value, 2)
+    actions, sanitized = continuous(value, 2)
     fine = np.isfinite(value) & (np.abs(value) <= 1)
     np.testing.assert_array_equal(actions[fine], value[fine])
-    np.testing.assert_array_equal(mended, (~fine).any(axis=(1, 2)))
+    np.testing.assert_array_equal(sanitized, (~fine).any(axis=(1, 2)))
     assert (actions[~np.isfinite(value)] == 0).all()
 
 

@@ -168,8 +168,8 @@ def test_eval_ends_in_a_table_and_a_results_folder(world: FakeWorld) -> None:
 
 def test_eval_without_a_terminal_prints_progress_as_lines(world: FakeWorld) -> None:
     lines = [line for line in evaluate("--num-envs", "10").stdout.splitlines() if "episodes, batch" in line]
-    assert lines[0] == "0/20 episodes, batch 1/2: setting up"
-    assert lines[-1].startswith("20/20 episodes, batch 2/2: 10 solved, ")
+    assert lines[0] == "0/20 episodes, batch 1/1: setting up"
+    assert lines[-1].startswith("20/20 episodes, batch 1/1: 10 solved, ")
 
 
 def test_quiet_prints_the_folder_only(world: FakeWorld) -> None:

@@ -157,7 +157,7 @@ def test_reset_rearms_what_is_finished_and_leaves_the_rest(env: BatchEnv) -> Non
     assert env.evaluate().num_steps.tolist() == [0, 0]
 
 
-def test_bad_numbers_are_mended_and_said(env: BatchEnv) -> None:
+def test_bad_numbers_are_sanitized_and_reported(env: BatchEnv) -> None:
     env.reset()
     actions = np.zeros((2, 7))
     actions[1] = [np.nan, 5.0, 0.0, 0.0, 0.0, np.inf, 0.0]

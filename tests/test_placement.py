@@ -9,7 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vecenv.placement import Placement, PlacementError, cross, each, episode_indices, task_indices
+from vecenv.placement import (
+    Placement,
+    PlacementError,
+    SpecError,
+    cross,
+    each,
+    episode_indices,
+    parse_tasks,
+    task_indices,
+)
 
 SIZES = {"num_tasks": 10, "num_episodes": 50}
 
@@ -215,3 +224,11 @@ def test_whatever_comes_is_refused_or_within_range(tasks: Any, episodes: Any) ->
         assert ((placement.task >= 0) & (placement.task < 10)).all()
         assert ((placement.episode >= 0) & (placement.episode < 50)).all()
         assert np.issubdtype(placement.task.dtype, np.integer)
+
+
+def test_patterns_name_every_task_that_matches() -> None:
+    names = ("pick_the_cup", "open_the_drawer", "pick_the_bowl")
+    assert parse_tasks("pick*", 3, names) == (0, 2)
+    assert parse_tasks("*drawer, 0", 3, names) == (1, 0)
+    with pytest.raises(SpecError, match="no task matches 'close\\*'"):
+        parse_tasks("close*", 3, names)

@@ -109,6 +109,8 @@ def test_protocols_of_another_family_are_refused_with_those_there_are(name: str,
 @pytest.mark.parametrize("name", [None, 3, ["openpi"]])
 def test_what_is_no_name_is_refused(name: Any) -> None:
     with pytest.raises(ProtocolError, match="is not available for libero"):
+        protocol(name)
+    with pytest.raises(vecenv.OptionError, match='field "protocol"'):
         vecenv.make("libero_goal", protocol=name)
 
 
@@ -118,8 +120,9 @@ def test_what_is_no_name_is_refused(name: Any) -> None:
 def test_the_default_protocol_is_what_the_environment_does_by_itself() -> None:
     env = vecenv.make("libero_goal", task=0, episodes=[0])
     assert isinstance(env, LiberoEnv)
-    assert env.config == LiberoConfig()
-    assert env.config.protocol == DEFAULT
+    assert vecenv.make_config("libero_goal", {}) == LiberoConfig()
+    assert env.config.rules("libero_goal") == LiberoConfig().rules("libero_goal")
+    assert env.config.protocol == LiberoConfig().protocol == DEFAULT
     env.close()
 
 
@@ -129,6 +132,7 @@ def test_make_follows_a_protocol(name: str) -> None:
     assert config.protocol == name
     for option, value in chosen.options("libero_goal").items():
         assert getattr(config, option) == value
+    assert isinstance(config.render, RenderConfig)
     assert (config.render.height, config.render.width) == (chosen.image_size, chosen.image_size)
     assert not chosen.departures("libero_goal", vars(config))
 
@@ -195,7 +199,7 @@ def test_an_evaluation_plans_the_protocols_episodes() -> None:
 )
 def test_simplers_tasks_have_as_many_episodes_as_their_protocol(suite: str, name: str, tasks: str, count: int) -> None:
     evaluation = Evaluation(EvalConfig(suite=suite, protocol=name, policy="zero", tasks=tasks))
-    assert len(evaluation.planned) == sum(map(len, evaluation.batches())) == count
+    assert len(evaluation.planned) == sum(map(len, evaluation.streams())) == count
 
 
 def test_simplers_metadata_counts_task_by_task_and_leaves_out_what_a_protocol_does_not_have() -> None:

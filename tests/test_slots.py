@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from vecenv import placement as placing
-from vecenv.contract import Control, Rendered
+from vecenv.contract import Control
+from vecenv.observations import Rendered
 from vecenv.slots import SlotBatch
 
 BUDGET = 3
@@ -23,7 +24,7 @@ class Refused(ValueError):
 
 
 class Scripted(SlotBatch):
-    """A simulator that does what it is told: ``tick`` names who succeeds and whose physics fails."""
+    """A simulator controlled by the test: ``tick`` takes the slots that succeed and those whose physics fails."""
 
     _error = Refused
 

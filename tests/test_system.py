@@ -137,10 +137,10 @@ def test_a_release_with_a_new_mesa_needs_no_backports(machine: Machine) -> None:
     assert machine.run("dry").stdout.splitlines() == ["apt-get update", f"{APT} mesa-vulkan-drivers"]
 
 
-def test_a_release_with_an_old_mesa_and_no_backports_is_told(machine: Machine) -> None:
+def test_a_release_with_an_old_mesa_and_no_backports_is_reported(machine: Machine) -> None:
     machine.has(libraries=ALL_LIBRARIES, installed={}, offered=OFFERED, root=True, release="jammy")
     done = machine.run("install")
-    assert "the newest mesa-vulkan-drivers here is 22.3.6-1: SIMPLER's pictures need 24.3" in done.stdout
+    assert "the newest mesa-vulkan-drivers here is 22.3.6-1: SIMPLER's images need 24.3" in done.stdout
     assert machine.calls == ["update"]
 
 
@@ -179,7 +179,7 @@ def test_without_apt_the_packages_are_named(machine: Machine) -> None:
 def test_a_check_says_what_is_missing_and_never_fails(machine: Machine) -> None:
     done = machine.run("check")
     assert done.returncode == 0
-    assert "pictures lack system libraries: libegl1 libgl1-mesa-dri libosmesa6 libvulkan1" in done.stdout
+    assert "missing system libraries for images: libegl1 libgl1-mesa-dri libosmesa6 libvulkan1" in done.stdout
     assert "make system" in done.stdout
     assert machine.calls == []
 

@@ -105,7 +105,8 @@ def make_config(
     from vecenv.util import configs
 
     chosen = registry.family_of(suite)
-    chosen.list_tasks(suite)  # an unknown suite is reported before anything else
+    if suite not in chosen.list_suites():
+        chosen.list_tasks(suite)  # raises the error that names the known suites
     kind = chosen.config_type()
     if config is not None and not isinstance(config, kind):
         raise OptionError(f"{suite}: config is a {type(config).__name__}, expected {kind.__name__}")

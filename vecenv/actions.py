@@ -1,7 +1,7 @@
-"""Whatever a caller calls an action becomes a validated array; every convention about actions is on this page.
+"""Validation of actions, and the table of every action convention.
 
-``step_continuous`` takes 7-vectors: a translation, a rotation as axis-angle vector, a gripper command. What the numbers
-mean is the suite's:
+``step_continuous`` takes 7-vectors: a translation, a rotation as axis-angle vector, a gripper command. Units and
+frames depend on the suite:
 
 ====================  =============  ===========  ==========================  =======================================
 suite                 translation    rotation     relative to                 gripper
@@ -12,9 +12,9 @@ simpler/google_robot  metres         radians      measured pose, base axes    ad
 ====================  =============  ===========  ==========================  =======================================
 
 Values are clipped: LIBERO's to 1, SIMPLER's to 1 m, pi/2 and 1. ``vecenv.make(..., gripper="binary")`` makes the
-gripper column of SIMPLER's suites 1 closed and 0 open (above or below one half), whichever robot it is, as the
-benchmark's seeds describe it. ``GRIPPER`` is the column as data. ``step_ee_pose`` and ``step_waypoints`` speak one
-language in all suites: xyz in metres and wxyz, absolute, world frame, grip 1 closed and 0 open.
+gripper column of both SIMPLER suites 1 closed and 0 open (threshold 0.5). ``GRIPPER`` is the column as data.
+``step_ee_pose`` and ``step_waypoints`` have one convention in all suites: xyz in metres and wxyz, absolute, world
+frame, grip 1 closed and 0 open.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.contract import ACTION_DIM, EE_POSE_DIM
 from vecenv.controllers.waypoint import Pose, WaypointPlan
@@ -37,7 +37,7 @@ _MOST_STEPS = 2**31 - 1
 
 @dataclass(frozen=True, kw_only=True)
 class GripperColumn:
-    """What the last column of a 7-vector says.
+    """Meaning of the last column of a 7-vector.
 
     Attributes:
         closed, open: values that close and open the gripper.
@@ -61,10 +61,10 @@ GRIPPER: Mapping[str, GripperColumn] = MappingProxyType(
 
 
 class ActionError(InvalidInput):
-    """An action has the wrong type or shape; the message says what arrived and what would be right."""
+    """An action has the wrong type or shape; the message states the given and the expected one."""
 
 
-def _array(value: Any, what: str, right: str) -> np.ndarray:
+def _array(value: object, what: str, right: str) -> np.ndarray:
     if isinstance(value, str):
         try:
             value = json.loads(value)
@@ -79,7 +79,7 @@ def _array(value: Any, what: str, right: str) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def continuous(value: Any, num_envs: int, limits: Any = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def continuous(value: object, num_envs: int, limits: npt.ArrayLike = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Validate the input of ``step_continuous``.
 
     Args:
@@ -107,7 +107,7 @@ def continuous(value: Any, num_envs: int, limits: Any = 1.0) -> tuple[np.ndarray
     return sanitized, (sanitized != array).any(axis=(1, 2))
 
 
-def ee_poses(value: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+def ee_poses(value: object, num_envs: int) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Validate the input of ``step_ee_pose``.
 
     Args:
@@ -134,7 +134,7 @@ def ee_poses(value: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray, tuple[s
     clean = np.where(np.isfinite(array), array, 0.0)
     largest = np.abs(clean[:, 3:7]).max(axis=1, keepdims=True)
     unit = largest[:, 0] > _NO_LENGTH
-    # Scaled first, because the square of a huge number is not finite.
+    # Scaled first, because the square of a huge number overflows.
     quat = np.where(unit[:, None], clean[:, 3:7] / np.maximum(largest, _NO_LENGTH), [1.0, 0.0, 0.0, 0.0])
     clean[:, 3:7] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
     errors = tuple(
@@ -144,7 +144,7 @@ def ee_poses(value: Any, num_envs: int) -> tuple[np.ndarray, np.ndarray, tuple[s
     return clean, finite & unit, errors
 
 
-def plan(value: Any, num_envs: int) -> tuple[WaypointPlan, tuple[str, ...]]:
+def plan(value: object, num_envs: int) -> tuple[WaypointPlan, tuple[str, ...]]:
     """Validate the input of ``step_waypoints``.
 
     Args:
@@ -171,7 +171,7 @@ def plan(value: Any, num_envs: int) -> tuple[WaypointPlan, tuple[str, ...]]:
     return WaypointPlan(pose, clean[..., 7], holds, wanted & usable.reshape(shape)), errors
 
 
-def _plan_field(value: Any, name: str, num_envs: int, tail: tuple[int, ...], count: int | None = None) -> np.ndarray:
+def _plan_field(value: object, name: str, num_envs: int, tail: tuple[int, ...], count: int | None = None) -> np.ndarray:
     found = value.get(name) if isinstance(value, Mapping) else getattr(value, name, None)
     right = f"[{', '.join(map(str, (num_envs, 'T' if count is None else count, *tail)))}]"
     array = _array([] if found is None else found, f"plan.{name}", right)
@@ -181,7 +181,7 @@ def _plan_field(value: Any, name: str, num_envs: int, tail: tuple[int, ...], cou
     return array
 
 
-def hold_steps(value: Any, num_envs: int) -> np.ndarray:
+def hold_steps(value: object, num_envs: int) -> np.ndarray:
     """Validate ``hold_steps``: one non-negative integer, or one a slot; returns int [B].
 
     Raises:

@@ -1,10 +1,10 @@
 """Where the asset trees live: LIBERO's task files, LIBERO's meshes and textures, robosuite's robot models.
 
 Nothing here imports `libero` or `robosuite` (slow, noisy, global state): a top-level import spec says where a package
-is installed, and a few marker files say that it is the one we need and that it is complete. Three environment variables
-(`VECENV_LIBERO_ROOT`, `VECENV_LIBERO_ASSETS`, `VECENV_ROBOSUITE_ASSETS`) point elsewhere. A tree that is missing or
-incomplete raises `AssetsMissing`, which carries the command that provides it; `asset_report` lists all three without
-raising.
+is installed, and a few marker files show that it is the expected one and that it is complete. Three environment
+variables (`VECENV_LIBERO_ROOT`, `VECENV_LIBERO_ASSETS`, `VECENV_ROBOSUITE_ASSETS`) point elsewhere. A tree that is
+missing or incomplete raises `AssetsMissing`, which carries the command that provides it; `asset_report` lists all three
+without raising.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class AssetsMissing(InvalidFile):
     """An asset tree is not installed, is incomplete, or an environment variable points at the wrong folder.
 
     Attributes:
-        name: which tree, e.g. ``"robosuite models"``.
+        name: the tree, e.g. ``"robosuite models"``.
         problem: what is wrong with it.
-        how_to_get: what to do about it, usually a pip command.
+        how_to_get: how to fix it, usually a pip command.
     """
 
     def __init__(self, name: str, problem: str, how_to_get: str) -> None:
@@ -45,10 +45,10 @@ class AssetRow:
     """One line of `asset_report`.
 
     Attributes:
-        name: which tree.
+        name: the tree.
         path: its root, or None when it was not found.
-        ok: it is there and complete.
-        how_to_get: what provides it (empty when ok).
+        ok: it exists and is complete.
+        how_to_get: the command that provides it (empty when ok).
         problem: what is wrong (empty when ok).
     """
 
@@ -64,8 +64,8 @@ class _Tree:
     """How to find one tree.
 
     Attributes:
-        name: what the report calls it.
-        variable: environment variable that overrides its place.
+        name: its name in the report.
+        variable: environment variable that overrides its location.
         package: top-level package it is installed with.
         inside: the tree's folder inside that package.
         markers: entries of the tree that must exist.
@@ -128,7 +128,7 @@ _LIBERO = _Tree(
     markers=("bddl_files", "init_files", "benchmark/libero_suite_task_map.py"),
     pip=_LIBERO_PIP,
 )
-# Five distributions fill one namespace package; each leaves a part_<i>.py, so a missing one shows.
+# Five distributions fill one namespace package; each leaves a part_<i>.py, so a missing one is detected.
 _LIBERO_ASSETS = _Tree(
     name="LIBERO meshes and textures",
     variable="VECENV_LIBERO_ASSETS",
@@ -164,7 +164,7 @@ def robosuite_assets_root() -> Path:
 
 
 def asset_report() -> list[AssetRow]:
-    """One row a tree, in a fixed order, never raising: what ``vecenv doctor`` prints."""
+    """One row per tree, in a fixed order, for ``vecenv doctor``; never raises."""
     return [_row(tree) for tree in (_LIBERO, _LIBERO_ASSETS, _ROBOSUITE)]
 
 

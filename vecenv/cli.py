@@ -1,8 +1,8 @@
-"""The ``vecenv`` command: ``doctor`` and ``list`` live here, other packages mount theirs.
+"""The ``vecenv`` command: ``doctor`` and ``list`` are defined here, other packages add theirs.
 
-Arguments come in, text and an exit status go out: 0 done, 1 something is wrong with the machine or the run, 2 the
-arguments were wrong. Commands of other packages are found through the entry-point group ``vecenv.commands``, so this
-package needs no import of theirs. Nothing heavy is imported before a command runs.
+Exit status: 0 done, 1 an error of the machine or the run, 2 wrong arguments. Commands of other packages are found
+through the entry-point group ``vecenv.commands``, so this package does not import them. Simulators are imported only
+when a command runs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def build_app(plugins: Iterable[importlib.metadata.EntryPoint] | None = None) -> typer.Typer:
-    """Put the command line together.
+    """Build the command-line application.
 
     Args:
         plugins: entry points to mount; those of the group ``vecenv.commands`` when not given.
@@ -56,7 +56,7 @@ def fail(message: str, code: int = 2) -> NoReturn:
 
 
 def doctor_command(as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead.")) -> None:
-    """Show versions, devices, GL, Vulkan and asset trees, what is missing, and the command that gets it."""
+    """Show versions, devices, GL, Vulkan and asset trees, what is missing, and the command that installs it."""
     from rich.console import Console
 
     from vecenv import doctor
@@ -74,7 +74,7 @@ def list_command(
     protocol: bool = typer.Option(False, "--protocols", help="List the evaluation protocols instead."),
     as_json: bool = typer.Option(False, "--json", help="Print JSON instead."),
 ) -> None:
-    """List the suites, the tasks of one suite, or the evaluation protocols and where they come from."""
+    """List the suites, the tasks of one suite, or the evaluation protocols and their sources."""
     import vecenv
 
     if protocol:
@@ -92,7 +92,7 @@ def list_command(
 
 
 def _list_protocols(suite: str, as_json: bool) -> None:
-    """Every protocol, or those of a suite."""
+    """Print every protocol, or those of a suite."""
     import vecenv
     from vecenv.protocols import PROTOCOLS
 
@@ -119,10 +119,10 @@ def _root(
 
 
 def _mount(app: typer.Typer, plugin: importlib.metadata.EntryPoint) -> None:
-    """Add one command (a function) or group of commands (a Typer); one that cannot be imported says why when called."""
+    """Add a command (a function) or a group (a Typer); one that cannot be imported prints the reason when called."""
     try:
         command: Any = plugin.load()
-    except Exception as error:  # someone else's package: the other commands must still work
+    except Exception as error:  # a package that is not ours; the other commands must still work
         command = _broken(plugin, error)
     if isinstance(command, typer.Typer):
         app.add_typer(command, name=plugin.name)
@@ -147,7 +147,7 @@ def _suite_rows(suites: Iterable[str]) -> list[dict[str, Any]]:
 
 
 def _task_rows(tasks: Iterable[Any], named: bool) -> list[dict[str, Any]]:
-    """LIBERO's names are its instructions, nearly; SIMPLER's are how its tasks are known."""
+    """Rows of the task list; names only for SIMPLER, because LIBERO's are nearly its instructions."""
     return [
         {"task": i, **({"name": task.name} if named else {}), "instruction": task.instruction}
         for i, task in enumerate(tasks)
@@ -165,7 +165,7 @@ def _print_rows(rows: list[dict[str, Any]]) -> None:
 
 
 def _print_protocols(chosen: Sequence[Protocol]) -> None:
-    """A table of what protocols fix, then each one's source and what else is to be known."""
+    """Print a table of the values that protocols fix, then the source and note of each."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -174,7 +174,7 @@ def _print_protocols(chosen: Sequence[Protocol]) -> None:
     table = Table(*rows[0], box=box.SIMPLE, pad_edge=False)
     for row in rows:
         table.add_row(*map(str, row.values()))
-    # A narrow screen breaks lines; cut numbers would be of no use.
+    # Wide tables break lines on a narrow screen instead of truncating numbers.
     natural = Console(width=1000).measure(table).maximum
     Console(width=max(console.width, natural)).print(table)
     for each in chosen:
@@ -183,7 +183,7 @@ def _print_protocols(chosen: Sequence[Protocol]) -> None:
 
 
 def _protocol_row(protocol: Protocol) -> dict[str, Any]:
-    """Columns for the screen; "-" stands for what is a task's own or not a choice."""
+    """Columns of the table; "-" is a value that each task decides, or that the family does not have."""
     horizon = "/".join(str(ticks) for ticks in dict(protocol.horizon).values())
     row = {
         "protocol": protocol.name,

@@ -1,6 +1,6 @@
-"""What this machine has, what is missing, and the command that gets it: the report behind ``vecenv doctor``.
+"""The report of ``vecenv doctor``: what this machine has, what is missing, and the command that installs it.
 
-Nothing comes in but the machine itself; out goes a :class:`Report` of rows a person or a program can read. Package
+``diagnose`` returns a :class:`Report`, ``print_report`` prints it. Package
 versions are read from installed metadata without importing the packages; everything that can crash or hang a process
 (GL contexts, the Vulkan loader, accelerator drivers) is probed in a child process with a time limit.
 """
@@ -20,7 +20,7 @@ import urllib.request
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from packaging.requirements import Requirement
 from rich.console import Console
@@ -29,15 +29,18 @@ from rich.table import Column, Table
 
 from vecenv.util.cores import usable_cores
 
+if TYPE_CHECKING:
+    from vecenv.assets import AssetRow
+
 DISTRIBUTION = "vecenv"
-# What installs the system's libraries from a clone.
+# Installs the system libraries, from a clone.
 SYSTEM_COMMAND = "make system"
 # Where the Vulkan loader looks for drivers, unless one of these variables names files.
 ICD_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
 ICD_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
-# Distributions worth naming although no requirement of ours names them.
+# Distributions shown although vecenv does not require them itself.
 ALSO_SHOWN = ("jaxlib", "robosuite")
-# Extras that collect other extras: "all" is not shown, "dev" is shown for what only it asks for.
+# Extras that include other extras: "all" is not shown, "dev" is shown for the packages that only it requires.
 COLLECTIONS = ("all",)
 LAST = "dev"
 PROBE_SECONDS = 60
@@ -86,7 +89,7 @@ for device in devices:
 _SAPIEN_PROBE = """
 import sapien
 sapien.render.RenderMaterial()
-print(f"SAPIEN {sapien.__version__} finds a device to draw with")
+print(f"SAPIEN {sapien.__version__} finds a device to render with")
 """
 
 _MESA_FIX = (
@@ -102,14 +105,14 @@ print("; ".join(f"{d.platform}:{d.id} {d.device_kind}" for d in jax.devices()))
 
 @dataclass(frozen=True)
 class Package:
-    """One distribution that vecenv or one of its extras asks for.
+    """One distribution that vecenv or one of its extras requires.
 
     Attributes:
         name: distribution name.
-        group: ``"core"``, the extra that asks for it, or ``"also"`` for what merely comes along.
-        wanted: version range asked for, "" for any.
-        version: version installed, "" when it is not.
-        ok: installed, in the wanted range.
+        group: ``"core"``, the extra that requires it, or ``"also"`` for others.
+        wanted: required version range, "" for any.
+        version: installed version, "" if it is not installed.
+        ok: installed, in the required range.
     """
 
     name: str
@@ -121,14 +124,14 @@ class Package:
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was probed.
+    """Result of one probe.
 
     Attributes:
         name: what was probed.
         ok: it works.
         core: the library cannot do its main job without it.
         detail: what was found, or why it does not work.
-        fix: the command that gets it, "" when there is nothing to get.
+        fix: the command that installs it, "" if there is nothing to install.
     """
 
     name: str
@@ -140,7 +143,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything ``vecenv doctor`` says.
+    """Everything that ``vecenv doctor`` reports.
 
     Attributes:
         packages: versions, core first, then by extra.
@@ -154,7 +157,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Everything the core needs is there."""
+        """Everything that the core needs is available."""
         return all(check.ok for check in self.checks if check.core)
 
     def to_json(self) -> str:
@@ -188,7 +191,7 @@ def machine() -> dict[str, Any]:
 
 
 def packages() -> tuple[Package, ...]:
-    """Every distribution vecenv's own metadata asks for, core first, then by extra; a distribution is named once."""
+    """Every distribution that vecenv's metadata requires, core first, then by extra; each is listed once."""
     try:
         metadata = importlib.metadata.distribution(DISTRIBUTION)
     except importlib.metadata.PackageNotFoundError:
@@ -233,7 +236,7 @@ def run_python(source: str, **environment: str) -> tuple[bool, str]:
     """Run Python source in a child process with extra environment variables.
 
     Returns:
-        Whether it exited 0, and its last line of output or of error.
+        Whether it exited with 0, and its last line of output or of error.
     """
     try:
         done = subprocess.run(
@@ -252,15 +255,15 @@ def run_python(source: str, **environment: str) -> tuple[bool, str]:
 
 
 def print_report(report: Report, console: Console) -> None:
-    """Print the report for a person: versions, what was probed, and last what is missing and how to get it."""
+    """Print the report as text: versions, probes, and last what is missing and how to install it."""
     console.print(_version_table(report.packages))
     console.print(_check_table(report.checks))
     missing = [check for check in report.checks if not check.ok]
     for check in missing:
         kind = "[red]needed[/]" if check.core else "optional"
-        how = check.fix or "nothing to install: see the detail above"
+        how = check.fix or "nothing to install; see the detail above"
         console.print(f"{kind} · {escape(check.name)}: {escape(how)}", highlight=False, soft_wrap=True)
-    lacking = "[red]The core lacks what is marked needed.[/]"
+    lacking = "[red]The packages and files marked needed are missing.[/]"
     console.print("Everything the core needs is there." if report.ok else lacking)
 
 
@@ -317,7 +320,7 @@ def _jax_check(run_probe: Callable[..., tuple[bool, str]]) -> Check:
 
 
 def _gl_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
-    """EGL and OSMesa: either draws the cameras, neither is needed for physics."""
+    """EGL and OSMesa: either renders the cameras, neither is needed for physics."""
     debian = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
     checks = []
     for backend, wanted in debian.items():
@@ -328,7 +331,7 @@ def _gl_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
 
 
 def _images_check(gl: dict[str, Check]) -> Check:
-    """What camera images are drawn with: what ``MUJOCO_GL`` says, else the first that works
+    """The GL that renders camera images: the one in ``MUJOCO_GL``, else the first that works
     (``vecenv.libero.render.gl``)."""
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
     working = [name for name, check in gl.items() if check.ok]
@@ -344,7 +347,7 @@ def _images_check(gl: dict[str, Check]) -> Check:
 
 
 def _icd_check() -> Check:
-    """The Vulkan drivers that are installed: files that tell the loader where a driver's library is."""
+    """The installed Vulkan drivers: files that name a driver's library for the loader."""
     named = next((os.environ[name] for name in ICD_VARIABLES if os.environ.get(name)), None)
     folders = [Path(folder) for folder in ICD_FOLDERS if Path(folder).is_dir()]
     files = (
@@ -358,7 +361,7 @@ def _icd_check() -> Check:
 
 
 def _driver(path: Path) -> tuple[str, bool]:
-    """What a driver's file says, and whether its library can be there: a name alone is looked up by the linker."""
+    """Content of a driver's file, and whether its library exists; a name without a path is left to the linker."""
     try:
         library = str(json.loads(path.read_text())["ICD"]["library_path"])
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -368,7 +371,7 @@ def _driver(path: Path) -> tuple[str, bool]:
 
 
 def _vulkan_check(run_probe: Callable[..., tuple[bool, str]]) -> Check:
-    """Vulkan: SAPIEN draws with it. It finds no device in Mesa's software driver before 24.3 (measured with 22.3)."""
+    """Vulkan: SAPIEN renders with it. It finds no device in Mesa's software driver before 24.3 (measured with 22.3)."""
     ok, text = run_probe(_VULKAN_PROBE)
     devices = text.splitlines()
     if ok and all(map(_mesa_too_old, devices)):
@@ -377,12 +380,12 @@ def _vulkan_check(run_probe: Callable[..., tuple[bool, str]]) -> Check:
 
 
 def _sapien_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
-    """Whether SAPIEN itself, where it is installed, finds something to draw with; its physics needs nothing."""
+    """Whether SAPIEN, if installed, finds a device to render with; its physics needs none."""
     if not installed_version("sapien"):
         return []
     ok, text = run_probe(_SAPIEN_PROBE)
-    fix = "" if ok else "a Vulkan driver, see the row above; SIMPLER without pictures works as it is"
-    return [Check("SAPIEN pictures", ok, False, text.splitlines()[-1] if text else "", fix)]
+    fix = "" if ok else "a Vulkan driver, see the row above; SIMPLER works without images"
+    return [Check("SAPIEN images", ok, False, text.splitlines()[-1] if text else "", fix)]
 
 
 def _mesa_too_old(device: str) -> bool:
@@ -394,14 +397,14 @@ def _mesa_too_old(device: str) -> bool:
 def _asset_checks() -> list[Check]:
     """One check for each tree that ``vecenv.assets.asset_report`` knows; a row with ``core = False`` is optional."""
     try:
-        rows: Iterable[Any] = importlib.import_module(f"{DISTRIBUTION}.assets").asset_report()
-    except Exception as error:  # a broken asset tree must not take the report down
+        rows: Iterable[AssetRow] = importlib.import_module(f"{DISTRIBUTION}.assets").asset_report()
+    except Exception as error:  # a broken asset tree must not stop the report
         return [Check("assets", False, True, _one_line(error), _install_command())]
     return [*(_asset_check(row) for row in rows), _simpler_asset_check()]
 
 
 def _simpler_asset_check() -> Check:
-    """SIMPLER's tree, which only its own suites need, and how many of its files something plain stands in for."""
+    """SIMPLER's tree, which only its suites need, and how many of its files are replaced by plain shapes."""
     assets: Any = importlib.import_module(f"{DISTRIBUTION}.simpler.assets.files")
     row = assets.asset_row()
     check = _asset_check(row)
@@ -410,7 +413,7 @@ def _simpler_asset_check() -> Check:
     return replace(check, core=False, detail=detail)
 
 
-def _asset_check(row: Any) -> Check:
+def _asset_check(row: AssetRow) -> Check:
     detail = str(row.path) if row.ok else row.problem or "not found"
     core = getattr(row, "core", True)
     return Check(f"assets: {row.name}", bool(row.ok), core, detail, "" if row.ok else row.how_to_get)
@@ -421,7 +424,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _cause(stderr: str) -> str:
-    """The line of a traceback that names the error: the last one that looks like ``SomethingError: why``."""
+    """The line of a traceback that names the error: the last one of the form ``SomethingError: why``."""
     lines = [line.strip() for line in stderr.strip().splitlines() if line.strip()]
     named = [line for line in lines if line.split(":")[0].split(".")[-1].endswith(("Error", "Exception"))]
     return (named or lines or [""])[-1]

@@ -1,4 +1,4 @@
-"""Which (task, episode) sits in which slot of a batch, and how a person says so.
+"""Task and episode of each slot of a batch, and how they are specified.
 
 Tasks are named by index, range or name, episodes by index, range or count: ``"0,3,5-7"``. ``vecenv.make`` and ``vecenv
 eval`` read both with the functions here, so that a specification means the same in either.
@@ -7,10 +7,10 @@ eval`` read both with the functions here, so that a specification means the same
 from __future__ import annotations
 
 import difflib
+import fnmatch
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -22,11 +22,11 @@ class PlacementError(InvalidInput):
 
 
 class SpecError(PlacementError):
-    """A specification of tasks or episodes cannot be read, or asks for something that does not exist."""
+    """A specification of tasks or episodes cannot be parsed, or names something that does not exist."""
 
 
 ALL = "all"
-# Names that an error lists before it only counts them.
+# An error lists this many names and counts the rest.
 _LISTED = 12
 _RANGE = re.compile(r"(\d+)(?:\s*-\s*(\d+))?")
 
@@ -46,15 +46,17 @@ class Placement:
         return len(self.task)
 
 
-def _ints(value: Any, what: str) -> list[int]:
+def _ints(value: object, what: str) -> list[int]:
     try:
-        items: list[Any] = [value] if isinstance(value, Mapping) else list(value)
-    except TypeError:
+        items = list(value) if isinstance(value, Iterable) and not isinstance(value, Mapping) else [value]
+    except TypeError:  # an array of no dimension
         items = [value]
+    whole: list[int] = []
     for item in items:
         if isinstance(item, bool) or not isinstance(item, int | np.integer):
             raise PlacementError(f"{what}: {item!r} is not an integer")
-    return [int(item) for item in items]
+        whole.append(int(item))
+    return whole
 
 
 def _check(values: Iterable[int], count: int, what: str) -> None:
@@ -67,12 +69,13 @@ def parse_tasks(spec: str, num_tasks: int, names: Sequence[str] = ()) -> tuple[i
     """Read task indices: ``"all"``, or indices, ranges and names such as ``"0,3,5-7,widowx_stack_cube"``.
 
     Args:
-        spec: the text. A name may be a part that only one name has; case does not matter, and spaces are underscores.
-        num_tasks: how many tasks the suite has.
-        names: what they are called.
+        spec: the text. A name may be a substring that only one name has, or a pattern with ``*`` for every name that
+            matches; case does not matter, and spaces are underscores.
+        num_tasks: number of tasks of the suite.
+        names: names of the tasks.
 
     Raises:
-        SpecError: the text cannot be read, names a task the suite does not have, or fits several.
+        SpecError: the text cannot be parsed, names a task the suite does not have, or matches several.
     """
     return tuple(range(num_tasks)) if spec.strip() == ALL else _parse_indices(spec, num_tasks, "task", names)
 
@@ -84,11 +87,11 @@ def parse_episodes(spec: str, num_episodes: int, every: int | None = None) -> tu
 
     Args:
         spec: the text.
-        num_episodes: how many the task has.
-        every: how many ``"all"`` are, where a protocol has fewer.
+        num_episodes: number of episodes of the task.
+        every: number of episodes of ``"all"``, if a protocol has fewer.
 
     Raises:
-        SpecError: the text cannot be read, or asks for episodes the task does not have.
+        SpecError: the text cannot be parsed, or names episodes the task does not have.
     """
     text = spec.strip()
     if text == ALL:
@@ -100,7 +103,7 @@ def parse_episodes(spec: str, num_episodes: int, every: int | None = None) -> tu
     return tuple(range(int(text)))
 
 
-def episode_indices(episodes: Any, num_episodes: int, every: int | None = None) -> tuple[int, ...]:
+def episode_indices(episodes: object, num_episodes: int, every: int | None = None) -> tuple[int, ...]:
     """Episodes as ``vecenv.make`` takes them: None or ``"all"``, a text as for ``parse_episodes``, or indices.
 
     Raises:
@@ -119,11 +122,11 @@ def episode_indices(episodes: Any, num_episodes: int, every: int | None = None) 
     return tuple(chosen)
 
 
-def task_indices(tasks: Any, names: Sequence[str]) -> tuple[int, ...]:
+def task_indices(tasks: object, names: Sequence[str]) -> tuple[int, ...]:
     """Tasks as ``vecenv.make`` takes them: None for all, a text as for ``parse_tasks``, an index, or several of either.
 
     Raises:
-        PlacementError: something that is neither, or a task that does not exist or is not the only one of its name.
+        PlacementError: another type, a task that does not exist, or a name that matches several.
     """
     if tasks is None or isinstance(tasks, str):
         return parse_tasks(ALL if tasks is None else tasks, len(names), names)
@@ -135,16 +138,16 @@ def task_indices(tasks: Any, names: Sequence[str]) -> tuple[int, ...]:
 
 
 def cross(
-    tasks: Any, episodes: Any, *, num_tasks: int, num_episodes: int | Mapping[int, int], every: int | None = None
+    tasks: object, episodes: object, *, num_tasks: int, num_episodes: int | Mapping[int, int], every: int | None = None
 ) -> Placement:
     """Every episode of every task, task by task.
 
     Args:
         tasks: one index or several.
-        episodes: for all tasks, as for ``episode_indices``; or a mapping task -> such.
-        num_tasks: how many there are.
-        num_episodes: how many there are of every task, or task by task; tasks left out have none.
-        every: how many episodes ``"all"`` are, where a protocol has fewer.
+        episodes: for all tasks, as for ``episode_indices``; or a mapping task -> episodes.
+        num_tasks: number of tasks.
+        num_episodes: number of episodes of every task, or a mapping task -> number; tasks left out have none.
+        every: number of episodes of ``"all"``, if a protocol has fewer.
 
     Raises:
         PlacementError: an index that does not exist, or nothing to place.
@@ -162,8 +165,8 @@ def cross(
     return Placement(columns[:, 0], columns[:, 1])
 
 
-def each(tasks: Any, episodes: Any, current: Placement, *, num_tasks: int, num_episodes: int) -> Placement:
-    """One task and one episode a slot; None keeps the current ones, a single number goes to every slot.
+def each(tasks: object, episodes: object, current: Placement, *, num_tasks: int, num_episodes: int) -> Placement:
+    """One task and one episode per slot; None keeps the current ones, a single number goes to every slot.
 
     Raises:
         PlacementError: an index that does not exist, or a number of entries other than the number of slots.
@@ -197,7 +200,17 @@ def _parse_indices(spec: str, count: int, what: str, names: Sequence[str] = ()) 
 def _parse_part(part: str, count: int, what: str, names: Sequence[str]) -> Sequence[int]:
     if part in names:
         return (names.index(part),)
+    if names and any(character in part for character in "*?["):
+        return _matching(part, what, names)
     return _parse_range(part, count, what) if _RANGE.fullmatch(part) else (_named(part, what, names),)
+
+
+def _matching(pattern: str, what: str, names: Sequence[str]) -> tuple[int, ...]:
+    """The names that match a pattern with ``*``, ``?`` and ``[...]``."""
+    found = tuple(i for i, name in enumerate(names) if fnmatch.fnmatchcase(_plain(name), _plain(pattern)))
+    if not found:
+        raise SpecError(f"no {what} matches {pattern!r}; there are {', '.join(_some(names))}")
+    return found
 
 
 def _parse_range(part: str, count: int, what: str) -> range:
@@ -211,7 +224,7 @@ def _parse_range(part: str, count: int, what: str) -> range:
 
 
 def _named(part: str, what: str, names: Sequence[str]) -> int:
-    """The only one of the names that has this part."""
+    """Index of the only name that contains this substring."""
     wanted = _plain(part)
     fitting = [name for name in names if _plain(name) == wanted] or [name for name in names if wanted in _plain(name)]
     if len(fitting) == 1:

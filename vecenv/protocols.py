@@ -1,9 +1,9 @@
-"""Published evaluation protocols as data: what an evaluation script does around a policy, and where it says so.
+"""Published evaluation protocols as data: what an evaluation script does around a policy, with its source.
 
-``protocol("openpi")`` says how many ticks an episode has in each suite, how it begins, which seed and resets put the
-fixtures where they are, how many episodes there are, what success means, and what a policy gets and gives. Every number
-was read in the project's own file, cited by repository, path and commit. ``make(protocol=...)``, ``vecenv eval
---protocol`` and ``eval_metadata`` read it from here. Plain data; nothing here knows a simulator.
+``protocol("openpi")`` has the number of ticks of an episode in each suite, how it begins, the seed and resets that
+decide fixture poses, the number of episodes, what success means, and a policy's inputs and outputs. Every number was
+read in the project's own file, cited by repository, path and commit. ``make(protocol=...)``, ``vecenv eval --protocol``
+and ``eval_metadata`` read it from here. This module does not depend on a simulator.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vecenv.errors import InvalidInput
 MAX_SEED = 2**32 - 1
 DEFAULT = "seed"
 LIBERO, SIMPLER = "libero", "simpler"
-# Tasks of a suite where there are not ten.
+# Suites that do not have ten tasks.
 _TASKS = {"libero_90": 90}
 
 
@@ -32,15 +32,15 @@ class ProtocolError(InvalidInput):
 class ResetLoop:
     """How an evaluation script seeds and resets upstream LIBERO environments.
 
-    Upstream's reset draws from NumPy's global generator where fixtures stand, so what an episode's scene looks like
-    depends on the last ``env.seed(s)`` and on the number of resets since. The defaults are the loop of OpenVLA and
+    Upstream's reset draws fixture poses from NumPy's global generator, so an episode's scene depends on the last
+    ``env.seed(s)`` and on the number of resets since. The defaults are the loop of OpenVLA and
     openpi: an environment a task, seeded once, then one reset an episode.
 
     Attributes:
         seed_per_episode, seed_per_task: what is added to the seed for each episode and task. When both are 0 the
             environment is seeded once, before the first episode; otherwise again before every reset.
         spare_resets: resets between the construction of an environment and its first seeding.
-        fresh: every episode has an environment of its own, rather than one a task.
+        fresh: every episode has a new environment; otherwise there is one per task.
     """
 
     seed_per_episode: int = 0
@@ -57,7 +57,7 @@ class ResetLoop:
             raise ProtocolError(f"ResetLoop: fresh={self.fresh!r}: expected True or False")
 
     def at(self, seed: int, task: int, episode: int) -> ResetPoint:
-        """Where an episode stands in the loop.
+        """The resets before an episode.
 
         Raises:
             ProtocolError: a seed that NumPy's legacy generator does not take.
@@ -128,19 +128,19 @@ class Source:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyInterface:
-    """What a policy gets and gives under a protocol.
+    """Inputs and outputs of a policy under a protocol.
 
     Attributes:
-        cameras: whose images it gets, of ``"agentview"`` and ``"wrist"``.
+        cameras: cameras whose images it gets, of ``"agentview"`` and ``"wrist"``.
         image_size: side of the images it gets, pixels; None for the rendered size.
-        rotation: by how many degrees they are turned against upstream's observations.
-            ``Egocentric.images`` of LIBERO are already turned by 180.
+        rotation: their rotation relative to upstream's observations, degrees.
+            ``Egocentric.images`` of LIBERO are already rotated by 180.
         resize: ``"pad"``: scaled to fit and padded to a square; ``"lanczos"``: through JPEG, then Lanczos; ``""``: not.
         crop: area of the centre crop, as a share of the image; 1 for none.
-        state: parts of the proprioception, in order, each a key of ``STATE_PARTS``; empty where it gets none.
-        gripper_open, gripper_close: the gripper values it gives; None for the robot's own.
-        gripper_threshold: from where on a value counts as the one or the other; None where it is passed on as it is.
-        replan_steps: actions executed before it is asked again; None where the policy decides.
+        state: parts of the proprioception, in order, each a key of ``STATE_PARTS``; empty for none.
+        gripper_open, gripper_close: the gripper values it outputs; None for the robot's own.
+        gripper_threshold: threshold between the two values; None if the value is passed on unchanged.
+        replan_steps: actions executed before the next call of the policy; None if the policy decides.
     """
 
     cameras: tuple[str, ...] = ("agentview", "wrist")
@@ -173,16 +173,16 @@ class Protocol:
             each task has its own.
         idle_steps: ticks without motion, gripper opening, before the policy acts; they do not count.
         start: ``"raw"``, the stored init states, or ``"settled"``; "" where the family has no such choice.
-        fixtures: where fixtures stand, likewise.
-        seed: what the environment is seeded with; None where each episode has its own.
-        reset_loop: how the script seeds and resets.
+        fixtures: how fixture poses are decided; "" where the family has no such choice.
+        seed: seed of the environment; None if each episode has its own.
+        reset_loop: how the script seeds and resets the environment.
         interleaved: the seed goes up by one from task to task, and by the number of tasks from episode to episode.
-        episodes: episodes a task; None where tasks differ.
+        episodes: episodes per task; None if tasks differ.
         image_size: side of rendered images, pixels; None for the family's own.
         success: ``"first"``: an episode ends when its goal first holds; ``"final"``: the verdict is read at its last
             tick.
-        policy: what a policy gets and gives.
-        note: what else is to be known.
+        policy: inputs and outputs of the policy.
+        note: anything else to know.
     """
 
     name: str
@@ -362,7 +362,7 @@ _LIBERO_PROTOCOLS = (
         horizon=_OPENVLA_HORIZON,
         seed=7,
         policy=PolicyInterface(image_size=256, resize="pad", gripper_threshold=0.0),
-        note="Wrist image and state are sent where a config asks for them; model servers decide when to replan.",
+        note="Wrist image and state are sent if a config enables them; model servers decide when to replan.",
     ),
     Protocol(
         name="rlinf",
@@ -472,7 +472,7 @@ def protocol(name: str, family: str = LIBERO) -> Protocol:
     """A protocol by name.
 
     Raises:
-        ProtocolError: the family has none of that name; the message lists those it has.
+        ProtocolError: the family has no protocol of that name; the message lists those it has.
     """
     known = PROTOCOLS[family]
     if not isinstance(name, str) or name not in known:

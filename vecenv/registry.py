@@ -10,10 +10,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
-from vecenv.contract import BatchEnv
 from vecenv.errors import InvalidInput, MissingDependency
+
+if TYPE_CHECKING:
+    from vecenv.contract import BatchEnv
 
 FAMILIES: Mapping[str, str] = MappingProxyType({"libero": "vecenv.libero.family", "simpler": "vecenv.simpler.family"})
 """Family -> the module that implements it. Suites are named ``family/suite``; LIBERO's have no prefix."""

@@ -1,7 +1,7 @@
-"""What all environments keep about their slots: who is live, who has finished and how, whose physics failed and why.
+"""State that every environment keeps per slot: live or finished, success, step counts, and failures of the physics.
 
-In: which episode sits in which slot, and from a simulator, ticks, successes and failures. Out: the verbs of
-``vecenv.contract`` that are the same everywhere, and its rules about finished and quarantined slots.
+A subclass supplies the simulator. This class implements the methods of ``vecenv.contract`` that do not depend on it,
+and the rules about finished and quarantined slots.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, Self, SupportsIndex, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo, Timings, Watcher
@@ -26,15 +27,15 @@ _LISTED = 8
 
 
 class SlotBatch(ABC):
-    """A batch of slots, each with one episode of one task; a subclass supplies the simulator and the other verbs.
+    """A batch of slots, each with one episode of one task; a subclass supplies the simulator and the other methods.
 
     Args:
         suite: the suite the tasks are of.
         num_envs: slots, B.
-        success: ``"first"`` ends an episode when its goal first holds; ``"final"`` goes on until the budget is spent.
+        success: ``"first"`` ends an episode when its goal first holds; ``"final"`` runs it until the budget is spent.
     """
 
-    # What calls that cannot be honoured raise.
+    # Raised by calls that are not possible in the present state.
     _error: ClassVar[type[ValueError]]
 
     def __init__(self, suite: str, num_envs: int, *, success: str = FIRST) -> None:
@@ -45,10 +46,10 @@ class SlotBatch(ABC):
         self._watchers: list[Watcher] = []
         self._physics_s = 0.0
 
-    # -- what the simulator supplies -----------------------------------------------------------------------------------
+    # -- supplied by the simulator -------------------------------------------------------------------------------------
 
     @abstractmethod
-    def _chosen(self, tasks: Any, episodes: Any) -> Placement:
+    def _chosen(self, tasks: object, episodes: object) -> Placement:
         """The present placement with other tasks and episodes, as ``set_episodes`` takes them."""
 
     @abstractmethod
@@ -61,34 +62,38 @@ class SlotBatch(ABC):
 
     @abstractmethod
     def _instruction(self, slot: int) -> str:
-        """What a slot's policy is told at present."""
+        """The current instruction of a slot."""
 
     @abstractmethod
     def _label(self, task: int) -> str:
-        """What a task is called in ``episode_id``."""
+        """Name of a task in ``episode_id``."""
 
     @abstractmethod
     def _failures(self) -> Mapping[int, str]:
-        """Why the physics of slots failed, by slot; those that are healthy are left out."""
+        """Slot -> why its physics failed; healthy slots are left out."""
 
     @abstractmethod
     def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Drive the slots ``moves`` (bool [B]) to ``targets`` [B, 8], or hold them for ``hold`` ticks (int [B]).
 
         Returns:
-            Rewards [B], and who arrived, bool [B].
+            Rewards [B], and which slots reached their target, bool [B].
         """
 
     @abstractmethod
     def _follow(self, plan: WaypointPlan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Follow a plan; returns rewards [B], and of each waypoint who arrived, bool [B, T], and its ticks [B, T]."""
+        """Follow a plan.
+
+        Returns:
+            Rewards [B]; for each waypoint, whether it was reached, bool [B, T], and its ticks, int [B, T].
+        """
 
     @abstractmethod
     def _tools(self) -> np.ndarray:
         """Poses of the end effectors, xyz (metres) and wxyz, world frame, [B, 7], a copy."""
 
     def _diagnostics(self) -> dict[str, Any]:
-        """What ``info`` holds besides what it always holds."""
+        """Additional entries of ``info``."""
         return {}
 
     # -- episodes ------------------------------------------------------------------------------------------------------
@@ -98,13 +103,15 @@ class SlotBatch(ABC):
         """Task and episode of each slot."""
         return self._placement
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None, slots: Any = None) -> None:
+    def set_episodes(
+        self, *, tasks: object = None, episodes: object = None, slots: npt.ArrayLike | None = None
+    ) -> None:
         """Choose what each slot runs next; ``reset`` makes it live.
 
         Args:
             tasks: task of each slot, by index or name (B of them, or one for all); None keeps them.
-            episodes: episode of each slot, likewise.
-            slots: which slots ``tasks`` and ``episodes`` are for, bool [B] or indices; the other slots continue their
+            episodes: episode of each slot (B of them, or one for all); None keeps them.
+            slots: slots that ``tasks`` and ``episodes`` are for, bool [B] or indices; the other slots continue their
                 episodes. None: all of them. In LIBERO a slot's new task must share its scene.
 
         Raises:
@@ -121,7 +128,7 @@ class SlotBatch(ABC):
                 rows, self._chosen(self._of_all(tasks, rows, "task"), self._of_all(episodes, rows, "episode"))
             )
 
-    def slot_indices(self, slots: Any) -> np.ndarray:
+    def slot_indices(self, slots: npt.ArrayLike | None) -> np.ndarray:
         """Indices of slots, ascending, from bool [B], indices, or None for all.
 
         Raises:
@@ -143,11 +150,11 @@ class SlotBatch(ABC):
             raise PlacementError(f"slots={slots!r}: a slot is named twice")
         return np.sort(rows).astype(int)
 
-    def _of_all(self, given: Any, rows: np.ndarray, what: str) -> Any:
-        """What each of B slots is to have, from what the slots ``rows`` are to have."""
+    def _of_all(self, given: object, rows: np.ndarray, what: str) -> object:
+        """A value for each of B slots: ``given`` for the slots ``rows``, the current one for the others."""
         if given is None:
             return None
-        values = [given] * len(rows) if isinstance(given, (str, int, np.integer)) else list(given)
+        values = list(given) if isinstance(given, Iterable) and not isinstance(given, str) else [given] * len(rows)
         if len(values) != len(rows):
             raise PlacementError(f"{len(values)} {what}s for {len(rows)} slots")
         merged: list[Any] = getattr(self._placement, what).tolist()
@@ -166,7 +173,7 @@ class SlotBatch(ABC):
         self._live[rows] = False
 
     def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:
-        """Get ready for what ``_placement`` now has in some slots; returns their step budgets, int [n]."""
+        """Prepare the new episodes of some slots; returns their step budgets, int [n]."""
         raise self._error("this environment cannot place single slots: leave slots out")
 
     def _place(self, placement: Placement) -> None:
@@ -183,7 +190,7 @@ class SlotBatch(ABC):
         self._fault = [""] * b
 
     def reset(self) -> ResetInfo:
-        """Make every slot live: finished slots are re-armed in place, live ones are left alone.
+        """Make every slot live: finished slots start their episode again, live ones are not changed.
 
         Returns:
             Episode metadata of every slot; no observation.
@@ -228,7 +235,7 @@ class SlotBatch(ABC):
         self._truncated[rows] |= ~self._terminated[rows]
 
     def instructions(self) -> tuple[str, ...]:
-        """What each slot's policy is told at present; in SIMPLER, tasks in two halves have two instructions."""
+        """The current instruction of each slot; SIMPLER tasks in two halves have two, one after the other."""
         return tuple(self._instruction(slot) for slot in range(self.num_envs))
 
     @property
@@ -242,7 +249,7 @@ class SlotBatch(ABC):
 
     @contextmanager
     def _stepping(self) -> Iterator[None]:
-        """Count the time spent inside as physics."""
+        """Add the time spent inside to that of physics."""
         started = time.perf_counter()
         try:
             yield
@@ -251,11 +258,13 @@ class SlotBatch(ABC):
 
     # -- stepping ------------------------------------------------------------------------------------------------------
 
-    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+    def step_ee_pose(
+        self, poses: npt.ArrayLike | Mapping[str, object] | None, hold_steps: npt.ArrayLike = 0
+    ) -> EePoseControl:
         """Drive each end effector to an absolute pose, or hold it while the gripper moves.
 
-        Every slot goes on its own until it is within tolerance, finished, or out of ticks; it uses at least one tick,
-        so the gripper command is always given. ``hold_steps`` > 0 skips the drive: that many ticks without motion.
+        Every slot moves on its own until it is within tolerance, finished, or out of ticks; it uses at least one tick,
+        so the gripper command is always executed. ``hold_steps`` > 0 skips the drive: that many ticks without motion.
         Poses are of the frame that ``observe_objects`` reports as ``ee_pose``; the class says which that is.
 
         Args:
@@ -267,10 +276,9 @@ class SlotBatch(ABC):
             ActionError: not numbers, or another shape.
         """
         self._check_live()
-        if isinstance(poses, Mapping):
-            poses, hold_steps = poses.get("pose", ()), poses.get("hold_steps", hold_steps)
-        targets, moves, errors = action_space.ee_poses(poses, self.num_envs)
-        hold = action_space.hold_steps(hold_steps, self.num_envs)
+        given: Mapping[str, object] = poses if isinstance(poses, Mapping) else {"pose": poses}
+        targets, moves, errors = action_space.ee_poses(given.get("pose", ()), self.num_envs)
+        hold = action_space.hold_steps(given.get("hold_steps", hold_steps), self.num_envs)
         before = self._steps.copy()
         with self._stepping():
             reward, arrived = self._drive(targets, hold, moves)
@@ -284,7 +292,7 @@ class SlotBatch(ABC):
             error=errors,
         )
 
-    def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:
+    def step_waypoints(self, plan: object, max_misses: int | None = None) -> PlanControl:
         """Follow a plan of waypoints, each slot its own, in one call.
 
         A slot goes from waypoint to waypoint as ``step_ee_pose`` does, without stopping, and ends at the end of its
@@ -294,7 +302,7 @@ class SlotBatch(ABC):
             plan: anything with ``poses`` [B, T, 7] (xyz in metres, wxyz, world frame), ``grip`` [B, T] (1 closed, 0
                 open), ``hold`` int [B, T] (ticks without motion in place of the drive; 0 drives) and ``valid``
                 bool [B, T] (the others are skipped).
-            max_misses: None never gives up.
+            max_misses: None for no limit.
 
         Raises:
             ActionError: not numbers, or another shape.
@@ -318,7 +326,7 @@ class SlotBatch(ABC):
     def watched(self, watcher: Watcher) -> Iterator[None]:
         """While inside, ``watcher(actions [B, 7], active bool [B])`` is called before every tick of an episode.
 
-        It sees what any verb executes, ``step_ee_pose`` included; settling is not part of an episode.
+        It is called for every stepping method, ``step_ee_pose`` included; settling is not part of an episode.
         """
         self._watchers.append(watcher)
         try:
@@ -327,7 +335,7 @@ class SlotBatch(ABC):
             self._watchers.remove(watcher)
 
     def _book(self, ticks: np.ndarray, success: np.ndarray, solved: np.ndarray | None = None) -> np.ndarray:
-        """Enter what each slot did.
+        """Update steps, success and rewards after ticks.
 
         Args:
             ticks: how many it took, int or bool [B].
@@ -346,7 +354,7 @@ class SlotBatch(ABC):
         self._terminated |= success & (active if self._until_success else spent)
         self._truncated |= spent & ~success
         self._quarantine(active)
-        # A slot that failed on its way to success has none, and earns nothing.
+        # A quarantined slot has no success and no reward.
         reward = np.where(self._solved & ~before, 1.0, 0.0)
         self._reward += reward
         return reward
@@ -364,9 +372,9 @@ class SlotBatch(ABC):
         reward: np.ndarray,
         before: np.ndarray,
         sanitized: np.ndarray | None = None,
-        **extra: Any,
+        **extra: np.ndarray | tuple[str, ...],
     ) -> _Kind:
-        """What a step returns: ``before`` are the steps that slots had taken, ``sanitized`` is nowhere unless given."""
+        """The return value of a step: ``before`` are the step counts before it; ``sanitized`` is False unless given."""
         info = {
             "sanitized": np.zeros(self.num_envs, bool) if sanitized is None else sanitized,
             "fault": tuple(self._fault),
@@ -400,7 +408,7 @@ class SlotBatch(ABC):
 
     @property
     def done(self) -> np.ndarray:
-        """Which slots have finished their episode, bool [B]."""
+        """Slots that have finished their episode, bool [B]."""
         return self._terminated | self._truncated
 
     def close(self) -> None:
@@ -445,4 +453,4 @@ class SlotBatch(ABC):
     def _check_live(self) -> None:
         self._check_open()
         if not self._live.all():
-            raise self._error("call reset() first: it makes the placed episodes live")
+            raise self._error("call reset() first; it starts the placed episodes")

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from vecenv.contract import BatchEnv, Control, ObjectsSnapshot, PlanControl
+from vecenv.contract import BatchEnv, Control, PlanControl
 from vecenv.manipulation.routes import RouteConfig, Stop
 from vecenv.manipulation.world import matrix
+from vecenv.observations import ObjectsSnapshot
 from voxposer import pushing
 from voxposer.interface import Interface
 from voxposer.language.llm import Llm

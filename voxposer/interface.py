@@ -9,15 +9,22 @@ arguments and defaults are upstream's (huangwl18/VoxPoser, ``interfaces.py``), w
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.manipulation.world import matrix
+from voxposer.language.observations import Observation
 from voxposer.perception.observation import LazyObservation
 from voxposer.perception.view import HAND_ALIASES, Perception
 from voxposer.quaternions import euler2quat, pointat2quat, qinverse, qmult, quat2euler, quaternion, unit, vector3
 from voxposer.requests import InterfaceError, MotionRequest
+
+T = TypeVar("T")
+# What programs give to ``execute``: a value, or a function that computes it from the present state.
+Observed = Observation | Callable[[], Observation]
+VoxelMap = npt.ArrayLike | Callable[[], npt.ArrayLike]
 
 
 class Interface:
@@ -74,7 +81,7 @@ class Interface:
         """Voxel of the hand, int [3]."""
         return self.perception.grid.voxel(self.perception.ee.pos)
 
-    def cm2index(self, cm: float, direction: Any) -> Any:
+    def cm2index(self, cm: float, direction: npt.ArrayLike) -> Any:
         """Centimetres as voxels along ``"x"``, ``"y"``, ``"z"`` (int), or along a vector [3] (int [3])."""
         size = self.perception.grid.resolution * 100
         if isinstance(direction, str):
@@ -89,7 +96,9 @@ class Interface:
 
     # -- maps ----------------------------------------------------------------------------------------------------------
 
-    def set_voxel_by_radius(self, voxel_map: np.ndarray, voxel_xyz: Any, radius_cm: float = 0, value: Any = 1) -> Any:
+    def set_voxel_by_radius(
+        self, voxel_map: np.ndarray, voxel_xyz: npt.ArrayLike, radius_cm: float = 0, value: npt.ArrayLike = 1
+    ) -> np.ndarray:
         """Set the voxels within a box of half edge ``radius_cm`` around a voxel (upstream's, for a ball)."""
         size = self.perception.grid.size
         centre = np.clip(np.round(vector3(voxel_xyz, "voxel_xyz")).astype(int), 0, size - 1)
@@ -126,12 +135,12 @@ class Interface:
 
     def execute(
         self,
-        movable: Any,
-        affordance_map: Any = None,
-        avoidance_map: Any = None,
-        rotation_map: Any = None,
-        velocity_map: Any = None,
-        gripper_map: Any = None,
+        movable: Observed,
+        affordance_map: VoxelMap | None = None,
+        avoidance_map: VoxelMap | None = None,
+        rotation_map: VoxelMap | None = None,
+        velocity_map: VoxelMap | None = None,
+        gripper_map: VoxelMap | None = None,
     ) -> None:
         """Ask for a motion of ``movable`` over maps; a map that is not given stays at the present state.
 
@@ -144,18 +153,14 @@ class Interface:
             gripper_map: 1 open, 0 closed, [N, N, N].
 
         Raises:
-            InterfaceError: a map of another shape, an affordance map without targets, or a thing to move without any.
+            InterfaceError: a map of another shape, an affordance map without targets, or an object to push without one.
         """
         seen = _now(movable)
         name = str(seen["name"])
         object_centric = name.lower() not in HAND_ALIASES
-        targets = None if affordance_map is None else self._map(affordance_map, "affordance map") >= 0.999
-        if targets is not None and not targets.any():
-            raise InterfaceError("the affordance map has no target: no voxel is 1")
-        if targets is None and object_centric:
-            raise InterfaceError(f"{name} is to move, but there is no affordance map with its target")
-        if object_centric and name not in self.perception.snapshot.movable:
-            raise InterfaceError(f"{name} cannot be pushed: it is fixed")
+        targets = None if affordance_map is None else self._targets(affordance_map)
+        if object_centric:
+            self._require_pushable(name, targets)
         request = MotionRequest(
             kind="stay" if targets is None else "path",
             movable=name,
@@ -193,7 +198,19 @@ class Interface:
         self.perception.move_hand(pos, matrix(request.rotation_at(end)))
         self._closed = request.closed_at_end(end)
 
-    def _map(self, given: Any, what: str, *tail: int) -> np.ndarray:
+    def _targets(self, given: VoxelMap) -> np.ndarray:
+        targets = self._map(given, "affordance map") >= 0.999
+        if not targets.any():
+            raise InterfaceError("the affordance map has no target: no voxel is 1")
+        return targets
+
+    def _require_pushable(self, name: str, targets: np.ndarray | None) -> None:
+        if targets is None:
+            raise InterfaceError(f"{name} is to move, but there is no affordance map with its target")
+        if name not in self.perception.snapshot.movable:
+            raise InterfaceError(f"{name} cannot be pushed: it is fixed")
+
+    def _map(self, given: VoxelMap, what: str, *tail: int) -> np.ndarray:
         value = np.asarray(_now(given))
         if value.shape != (*self._shape, *tail):
             raise InterfaceError(f"the {what} has shape {value.shape}; expected {(*self._shape, *tail)}")
@@ -201,27 +218,27 @@ class Interface:
             raise InterfaceError(f"the {what} holds values that are not finite")
         return value
 
-    def _avoidance(self, given: Any) -> np.ndarray | None:
+    def _avoidance(self, given: VoxelMap) -> np.ndarray | None:
         value = np.clip(self._map(given, "avoidance map"), 0, 1).astype(np.float32)
         return value if value.any() else None
 
-    def _rotation(self, given: Any) -> np.ndarray:
+    def _rotation(self, given: VoxelMap | None) -> np.ndarray:
         if given is None:
             return quaternion(self.perception.ee.rotation)
         return _folded(self._map(given, "rotation map", 4), tail=1)
 
-    def _gripper(self, given: Any) -> np.ndarray:
+    def _gripper(self, given: VoxelMap | None) -> np.ndarray:
         if given is None:
             return np.asarray(0.0 if self._closed else 1.0)
         return _folded(self._map(given, "gripper map"))
 
 
-def _now(value: Any) -> Any:
+def _now(value: T | Callable[[], T]) -> T:
     """The value, or what it evaluates to now."""
-    return value() if callable(value) else value
+    return cast(T, value() if callable(value) else value)
 
 
-def _folded(volume: Any, tail: int = 0) -> np.ndarray:
+def _folded(volume: npt.ArrayLike, tail: int = 0) -> np.ndarray:
     """A map in single precision, reduced to its one value where it has only one."""
     value = np.asarray(volume)
     if value.ndim == tail:

@@ -168,7 +168,7 @@ def situation(task: PushTask, perception: Perception, config: PushingConfig) -> 
 
 
 def _detours(centre: np.ndarray, end: np.ndarray, config: PushingConfig) -> list[np.ndarray]:
-    """Goals beside the straight line, those that deviate least first, [3] each."""
+    """Goals to either side of the straight line, the smallest deviation first, [3] each."""
     ahead = (end - centre) * [1.0, 1.0, 0.0]
     ahead /= max(float(np.linalg.norm(ahead)), 1e-6)
     aside = np.array([-ahead[1], ahead[0], 0.0])
@@ -224,7 +224,7 @@ def _way(slot: int, push: Push, situation: PushSituation, config: PushingConfig)
 def _touchable(
     task: PushTask, perception: Perception, target: np.ndarray, lowest: float, config: PushingConfig
 ) -> np.ndarray:
-    """Points of a thing whose face looks against a push from there to a target that has room to start, bool [M]."""
+    """Points of an object that face away from a target and from which a push to it has room to start, bool [M]."""
     cloud = perception.snapshot.objects[task.name]
     ahead = (target - cloud.points) * [1.0, 1.0, 0.0]
     ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
@@ -245,7 +245,7 @@ def _touchable(
 def _reach_back(
     points: np.ndarray, rows: np.ndarray, ahead: np.ndarray, lowest: float, config: PushingConfig
 ) -> np.ndarray:
-    """How far behind some of the points the thing is met first by a hand that comes from behind, metres [len(rows)]."""
+    """Distance behind each of some points at which a hand from behind first meets the object, metres, [len(rows)]."""
     touched = np.maximum(points[rows], [-np.inf, -np.inf, lowest])
     offset = points[None] - touched[:, None]
     back = -np.einsum("ijk,ik->ij", offset, ahead)
@@ -263,10 +263,10 @@ def _fits(
     start: tuple[float, float],
     config: PushingConfig,
 ) -> np.ndarray:
-    """Whether pushes of a thing at ``contacts`` [M, 3] along ``ahead`` [M, 3] have room, bool [M].
+    """Whether pushes of an object at ``contacts`` [M, 3] along ``ahead`` [M, 3] have room, bool [M].
 
-    The hand needs it where it starts, so far before the contact and with that slant; its fingers need it, apart from
-    the thing, on the way.
+    ``start`` is the distance before the contact at which the hand starts, and its slant. The whole hand needs room
+    there; on the way to the contact its fingers need room, the pushed object ignored.
     """
     distance, slant = start
     begin = _raised(contacts - distance * ahead, lowest)

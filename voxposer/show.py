@@ -12,7 +12,8 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from voxposer.agent import Agent, AgentConfig, PlannedMotion
 from voxposer.language.llm import Llm, LlmConfig
 from voxposer.language.lmp_config import Call
 from voxposer.paths import obstacle_map
+
+if TYPE_CHECKING:
+    from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 # Voxels of an obstacle map above this are drawn, and no more than that many.
 _DRAWN_ABOVE = 0.3
@@ -187,7 +191,7 @@ def figure(motion: PlannedMotion) -> Any:
     return result
 
 
-def _cloud(go: Any, name: str, points: np.ndarray, size: int, colour: str, opacity: float) -> Any:
+def _cloud(go: ModuleType, name: str, points: np.ndarray, size: int, colour: str, opacity: float) -> Any:
     x, y, z = points.T
     marker = {"size": size, "color": colour, "opacity": opacity}
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker)
@@ -231,12 +235,12 @@ def save_image(shown: EpisodeRecord, path: Path) -> None:
     sheet = Figure(figsize=(4.2 * columns, 4.0 * rows), layout="constrained")
     sheet.suptitle(f"{shown.instruction} ({_author(shown.model)})")
     for number, motion in enumerate(motions, start=1):
-        axes: Any = sheet.add_subplot(rows, columns, number, projection="3d")
+        axes = sheet.add_subplot(rows, columns, number, projection="3d")
         _draw(axes, motion)
     sheet.savefig(path, dpi=110)
 
 
-def _draw(axes: Any, motion: PlannedMotion) -> None:
+def _draw(axes: Axes3D, motion: PlannedMotion) -> None:
     found = layers(motion)
     axes.set_title(motion.text, fontsize=8)
     way = np.concatenate([found["targets"], found["hand's way"]])

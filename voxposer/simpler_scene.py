@@ -1,37 +1,39 @@
-"""SIMPLER's WidowX scenes as VoxPoser looks at them: another hand, other names, other ticks.
+"""SIMPLER's WidowX scenes for VoxPoser: conversions of the hand's frame, of names and of the gripper's sign.
 
-A batch of ``simpler/bridge`` comes in; :func:`hands` gives a view of it that speaks the same verbs about VoxPoser's
-hand (third column out of the palm, second the closing direction, grip site between the pads) and the agent's options
-for that robot. Things get the names that the instructions use. Nothing of the task is read beyond what
+A batch of ``simpler/bridge`` comes in; :func:`hands` wraps it in a batch whose poses are those of VoxPoser's hand
+(third column out of the palm, second the closing direction, grip site between the pads) and gives the agent's options
+for that robot. Objects get the names that the instructions use. Nothing of the task is read beyond what
 :mod:`voxposer.perception` reads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.actions import GRIPPER
 from vecenv.contract import (
     BatchEnv,
     Control,
     EePoseControl,
-    Egocentric,
     Metrics,
-    Objects,
-    ObjectsSnapshot,
     PlanControl,
-    PointCloud,
     ResetInfo,
+    State,
+    Timings,
+    Watcher,
 )
 from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.routes import RouteConfig
 from vecenv.manipulation.world import Margins, matrix
+from vecenv.observations import Egocentric, Objects, ObjectsSnapshot, PointCloud
+from vecenv.placement import Placement
 from voxposer.agent import AgentConfig
 from voxposer.perception.config import PerceptionConfig
 from voxposer.planning.plan import PlanConfig, SubtaskPlan
@@ -54,7 +56,7 @@ WIDOWX_GRIPPER = Gripper(
     palm=0.022,
     palm_half=(0.0523, 0.0360),
 )
-# What instructions call the models.
+# Names of the models in the instructions.
 NAMES: Mapping[str, str] = MappingProxyType(
     {
         "bridge_spoon_generated_modified": "spoon",
@@ -68,14 +70,14 @@ NAMES: Mapping[str, str] = MappingProxyType(
         "sink": "sink",
     }
 )
-# How far the tool is from the robot's base when an episode begins; the robot looks along -x. Metres.
+# Distance of the tool from the robot's base at the start of an episode; the robot faces -x. Metres.
 _HOME_REACH = -0.28
 # Samples of a table that the snapshot has no points of: half a side and distance, metres.
 _TABLE_HALF, _TABLE_STEP = 0.5, 0.1
 
 
 class NoHandView(InvalidInput):
-    """VoxPoser has no view of this suite's robot; the message says of which it has."""
+    """VoxPoser does not support this suite's robot; the message lists those it supports."""
 
 
 def widowx_config(passes: int = 3) -> AgentConfig:
@@ -121,43 +123,90 @@ class HandView:
     """
 
     def __init__(self, env: BatchEnv) -> None:
-        self.env, self.num_envs = env, env.num_envs
-        option = getattr(getattr(env, "config", None), "gripper", _NATIVE)
+        self.env, self.suite, self.num_envs = env, env.suite, env.num_envs
+        option = getattr(env.config, "gripper", _NATIVE)
         self._gripper = GRIPPER[SUITE if option == _NATIVE else option]
+
+    @property
+    def config(self) -> object:
+        """The environment's options."""
+        return self.env.config
+
+    @property
+    def control_hz(self) -> float:
+        """Control ticks a second."""
+        return self.env.control_hz
+
+    @property
+    def placement(self) -> Placement:
+        """Task and episode of each slot."""
+        return self.env.placement
+
+    @property
+    def done(self) -> np.ndarray:
+        """Which slots have finished their episode, bool [B]."""
+        return self.env.done
+
+    @property
+    def timings(self) -> Timings:
+        """Seconds spent so far in physics and in rendering images."""
+        return self.env.timings
+
+    def instructions(self) -> tuple[str, ...]:
+        """The present instruction of each slot."""
+        return self.env.instructions()
 
     def reset(self) -> ResetInfo:
         """Make every slot live."""
         return self.env.reset()
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
-        """Choose what each slot runs next."""
-        self.env.set_episodes(tasks=tasks, episodes=episodes)
+    def set_episodes(
+        self,
+        *,
+        tasks: npt.ArrayLike | None = None,
+        episodes: npt.ArrayLike | None = None,
+        slots: npt.ArrayLike | None = None,
+    ) -> None:
+        """Choose what each slot runs next, or some slots."""
+        self.env.set_episodes(tasks=tasks, episodes=episodes, slots=slots)
 
     def evaluate(self) -> Metrics:
         """Verdicts."""
         return self.env.evaluate()
 
-    def observe_egocentric(self) -> Egocentric:
-        """Cameras and joints."""
-        return self.env.observe_egocentric()
+    def state(self) -> State:
+        """Physics state of every slot, a copy."""
+        return self.env.state()
+
+    def set_state(self, state: State) -> None:
+        """Overwrite the physics state of every slot."""
+        self.env.set_state(state)
+
+    def watched(self, watcher: Watcher) -> AbstractContextManager[None]:
+        """While inside, ``watcher`` is called before every tick of an episode."""
+        return self.env.watched(watcher)
+
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
+        """Cameras and joints; images of some slots only, where ``slots`` says which."""
+        return self.env.observe_egocentric(slots)
 
     def close(self) -> None:
         """Release the simulator."""
         self.env.close()
 
-    def step_continuous(self, actions: Any) -> Control:
+    def step_continuous(self, actions: npt.ArrayLike) -> Control:
         """Advance; the gripper column is LIBERO's."""
         column = self._gripper
-        actions = np.array(actions, float)
-        actions[..., 6] = np.where(actions[..., 6] > 0, column.closed, column.open)
-        return self.env.step_continuous(actions)
+        converted = np.array(actions, float)
+        converted[..., 6] = np.where(converted[..., 6] > 0, column.closed, column.open)
+        return self.env.step_continuous(converted)
 
-    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
-        """Drive the hand to poses, [B, 8]; what comes back speaks of the hand too."""
-        poses = np.array(poses, float)
-        if poses.size:
-            poses[..., :7] = tool_poses(poses[..., :7])
-        control = self.env.step_ee_pose(poses, hold_steps)
+    def step_ee_pose(self, poses: npt.ArrayLike, hold_steps: npt.ArrayLike = 0) -> EePoseControl:
+        """Drive the hand to poses, [B, 8]; the final pose returned is the hand's."""
+        converted = np.array(poses, float)
+        if converted.size:
+            converted[..., :7] = tool_poses(converted[..., :7])
+        control = self.env.step_ee_pose(converted, hold_steps)
         return replace(control, final_pose=hand_poses(control.final_pose))
 
     def step_waypoints(self, plan: SubtaskPlan, max_misses: int | None = None) -> PlanControl:
@@ -167,14 +216,14 @@ class HandView:
         )
         return replace(control, final_pose=hand_poses(control.final_pose))
 
-    def observe_objects(self, points: str = "surface") -> Objects:
-        """Ground truth about the hand, under the names of the instructions."""
-        seen = self.env.observe_objects(points)
+    def observe_objects(self, points: str = "surface", slots: npt.ArrayLike | None = None) -> Objects:
+        """Ground truth with the pose of VoxPoser's hand, under the names that the instructions use."""
+        seen = self.env.observe_objects(points, slots)
         return replace(seen, snapshot=tuple(each and view(each) for each in seen.snapshot))
 
 
 def view(snapshot: ObjectsSnapshot) -> ObjectsSnapshot:
-    """A snapshot of ``simpler/bridge`` with the pose of the hand, the distances of its pads, and names as spoken."""
+    """A snapshot of ``simpler/bridge`` with the pose of the hand, distances of its pads and spoken names."""
     left, right = np.maximum(snapshot.gripper - PAD_OFFSET, 0.0)
     return replace(
         snapshot,
@@ -191,7 +240,7 @@ def view(snapshot: ObjectsSnapshot) -> ObjectsSnapshot:
 
 
 def called(name: str) -> str:
-    """What instructions call a model."""
+    """The name of a model in the instructions."""
     return NAMES.get(name, name)
 
 
@@ -212,7 +261,7 @@ def _turned(poses: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _with_table(snapshot: ObjectsSnapshot) -> PointCloud:
-    """The scene; where it has nothing but the things, with the table that they stand on."""
+    """The scene, with samples of the table added where it has none."""
     named = sum(len(cloud.points) for cloud in snapshot.objects.values())
     if len(snapshot.scene.points) > named:
         return snapshot.scene

@@ -81,7 +81,9 @@ class EvalConfig:
     # Numbers in YAML may stand for text: ``episodes: 5`` means ``"5"``.
     __pydantic_config__: ClassVar[dict[str, bool]] = {"coerce_numbers_to_str": True}
 
-    suite: str = field(metadata=_about("Suite to evaluate; `vecenv list` names them.", default="required"))
+    suite: str = field(
+        metadata=_about("Suite to evaluate, or several: a,b,c; `vecenv list` names them.", default="required")
+    )
     policy: str | None = field(
         default=None,
         metadata=_about(
@@ -89,7 +91,7 @@ class EvalConfig:
             default="the suite's scripted one",
         ),
     )
-    tasks: str = field(default=ALL, metadata=_about("all, or indices, ranges and names: 0,3,5-7."))
+    tasks: str = field(default=ALL, metadata=_about("all, or indices, ranges, names and patterns: 0,3,5-7 or pick*."))
     episodes: str | Sequence[int] = field(
         default=ALL, metadata=_about("all (the protocol's), a count, or indices and ranges: 0,3,5-7.")
     )
@@ -103,6 +105,18 @@ class EvalConfig:
         metadata=_about("Step budget of an episode, control ticks.", default="the protocol's", minimum=1),
     )
     seed: int | None = field(default=None, metadata=_about("Seed of environment and policy.", default="the protocol's"))
+    seeds: str | None = field(
+        default=None, metadata=_about("Several seeds, each a run of its own: 0,1,2.", default="one seed")
+    )
+    image_size: int | None = field(
+        default=None, metadata=_about("Side of camera images, pixels (LIBERO).", default="the protocol's", minimum=1)
+    )
+    lod: str | None = field(
+        default=None, metadata=_about("Level of detail of images: original, exact or fast (LIBERO).", default="exact")
+    )
+    colors: str | None = field(
+        default=None, metadata=_about("Colors of images: published or current (LIBERO).", default="published")
+    )
     env_args: Mapping[str, Any] = field(
         default_factory=dict, metadata=_about("key=value for vecenv.make; repeatable.", flag="env-arg")
     )
@@ -122,6 +136,12 @@ class EvalConfig:
     record_states: bool = field(
         default=False, metadata=_about("Keep the states too; implies --record.", resumable=True)
     )
+    retries: int = field(
+        default=1,
+        metadata=_about(
+            "How often episodes that ended in an error run again in the same run.", minimum=0, resumable=True
+        ),
+    )
     fail_fast: bool = field(default=False, metadata=_about("Stop at the first batch that raises.", resumable=True))
 
     def __post_init__(self) -> None:
@@ -131,9 +151,30 @@ class EvalConfig:
                 raise ConfigError(f"{each.name} must be at least {minimum}, not {value}")
 
     @property
+    def suites(self) -> tuple[str, ...]:
+        """The suites to evaluate."""
+        return tuple(dict.fromkeys(name.strip() for name in self.suite.split(",") if name.strip()))
+
+    @property
+    def all_seeds(self) -> tuple[int | None, ...]:
+        """The seeds to run, (None,) for the one that is usual.
+
+        Raises:
+            ConfigError: something that is no whole number.
+        """
+        if self.seeds is None:
+            return (self.seed,)
+        if self.seed is not None:
+            raise ConfigError("give seed or seeds, not both")
+        try:
+            return tuple(dict.fromkeys(int(text) for text in self.seeds.split(",")))
+        except ValueError:
+            raise ConfigError(f"seeds {self.seeds!r}: write whole numbers with commas: 0,1,2") from None
+
+    @property
     def policy_name(self) -> str:
         """The policy to run: the one given, else the suite's scripted one."""
-        return self.policy or default_policy(self.suite)
+        return self.policy or default_policy(self.suites[0])
 
     @property
     def records(self) -> bool:

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control
+from vecenv.errors import VecenvError
 from vecenv_eval.policies import Policy
 
 # Calls of a policy in a row that may leave every live slot where it was, before it counts as stuck.
 MAX_IDLE_CALLS = 100
 
 
-class PolicyStuck(RuntimeError):
+class PolicyStuck(VecenvError, RuntimeError):
     """The policy keeps returning without a step being taken in any live slot."""
 
 
-def drive(env: BatchEnv, policy: Policy) -> Iterator[tuple[Control, np.ndarray]]:
+def drive(
+    env: BatchEnv, policy: Policy, refill: Callable[[np.ndarray], np.ndarray] | None = None
+) -> Iterator[tuple[Control, np.ndarray]]:
     """Let a policy act on a batch that was just reset, until every slot has finished.
+
+    Args:
+        env: the environment.
+        policy: the policy, which was reset for it.
+        refill: called after each control with the slots that have finished, bool [B]; begins new episodes in some of
+            them and returns their indices.
 
     Yields:
         Each control as it comes, and which slots it finished, bool [B].
@@ -37,5 +46,8 @@ def drive(env: BatchEnv, policy: Policy) -> Iterator[tuple[Control, np.ndarray]]
         idle = 0 if moved else idle + 1
         if idle >= MAX_IDLE_CALLS:
             raise PolicyStuck(f"policy {policy.name!r}: {idle} calls of act() in a row took no step in any live slot")
-        done, steps = done | finished, control.step_index
+        done, steps = done | finished, control.step_index.copy()
         yield control, finished
+        if refill is not None and done.any():
+            begun = refill(done)
+            done[begun], steps[begun] = False, 0

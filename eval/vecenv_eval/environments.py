@@ -1,13 +1,13 @@
 """The environment that runs the batches: built once, re-placed while scenes stay the same, closed at the end.
 
-A :class:`~vecenv_eval.episodes.Batch` comes in; :class:`Placed` goes out: the batch after its reset, and the episode in
-each slot.
+A :class:`~vecenv_eval.episodes.Stream` comes in; :class:`Placed` goes out: its first episodes after their reset, and
+which of them is in each slot.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +16,13 @@ from vecenv.assets import AssetsMissing
 from vecenv.contract import BatchEnv, ResetInfo
 from vecenv.errors import VecenvError
 from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.episodes import Batch, Episode, Suite
+from vecenv_eval.episodes import Episode, Stream, Suite
 from vecenv_eval.simulator import Simulator
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A batch in its environment, just reset.
+    """The first episodes of a stream in their environment, just reset.
 
     Attributes:
         env: the environment.
@@ -54,23 +54,23 @@ class Environments:
         self._env: BatchEnv | None = None
         self._layout: tuple[Hashable, ...] = ()
 
-    def place(self, batch: Batch) -> Placed:
-        """Place a batch and reset it; an environment is built only when a slot needs another scene.
+    def place(self, stream: Stream) -> Placed:
+        """Place a stream's first episodes and reset; an environment is built only when a slot needs another scene.
 
         Raises:
             ConfigError: the environment refuses a setting, or assets are missing.
             RuntimeError: it placed other episodes than were asked for.
         """
         started = time.perf_counter()
-        layout = tuple(self._suite.scenes[slot.task] for slot in batch.slots)
+        layout = tuple(self._suite.scenes[slot.task] for slot in stream.first)
         if self._env is not None and layout == self._layout:
-            self._env.set_episodes(tasks=[s.task for s in batch.slots], episodes=[s.episode for s in batch.slots])
+            self._env.set_episodes(tasks=[s.task for s in stream.first], episodes=[s.episode for s in stream.first])
         else:
             self.close()
-            self._env, self._layout = self._make(batch), layout
+            self._env, self._layout = self._make(stream), layout
             self._on_make(self._env)
         info = self._env.reset()
-        return Placed(self._env, info, _slots(info, batch), time.perf_counter() - started)
+        return Placed(self._env, info, slots_of(info, stream.first), time.perf_counter() - started)
 
     def close(self) -> None:
         """Close the environment in use, if there is one."""
@@ -78,11 +78,14 @@ class Environments:
         if env is not None:
             env.close()
 
-    def _make(self, batch: Batch) -> BatchEnv:
-        """Build an environment. A value it refuses is the config's fault: no other batch would fare better."""
-        arguments = {"tasks": list(batch.tasks), "episodes": list(batch.episodes), **make_arguments(self._config)}
+    def _make(self, stream: Stream) -> BatchEnv:
+        """Build an environment. A value it refuses is the config's fault: no other stream would fare better."""
+        by_task = {t: [slot.episode for slot in stream.first if slot.task == t] for t in stream.tasks}
+        alike = all(episodes == by_task[stream.tasks[0]] for episodes in by_task.values())
+        placed = {"tasks": list(stream.tasks), "episodes": by_task[stream.tasks[0]] if alike else by_task}
+        arguments = {**placed, **make_arguments(self._config)}
         try:
-            return self._simulator.make(batch.suite, **arguments)
+            return self._simulator.make(stream.suite, **arguments)
         except AssetsMissing as error:
             raise ConfigError(str(error)) from error
         except (VecenvError, ValueError) as error:
@@ -95,15 +98,31 @@ def make_arguments(config: EvalConfig) -> dict[str, Any]:
     given: dict[str, Any] = {"max_steps": config.max_steps}
     if family(config.suite) == protocols.LIBERO:  # SIMPLER's episodes depend on their number alone
         given["seed"] = config.seed
+    images = {"height": config.image_size, "width": config.image_size, "lod": config.lod, "colors": config.colors}
+    wanted = {name: value for name, value in images.items() if value is not None}
+    if wanted:
+        if family(config.suite) != protocols.LIBERO:
+            raise ConfigError(
+                f"{config.suite}: image size, level of detail and colors are LIBERO's; SIMPLER's are fixed"
+            )
+        arguments["render"] = {**_render_of(arguments), **wanted}
     if config.protocol != protocols.DEFAULT:
         given["protocol"] = config.protocol
     return {**arguments, **{name: value for name, value in given.items() if value is not None}}
 
 
-def _slots(info: ResetInfo, batch: Batch) -> list[Episode]:
-    """The episode in each slot, as the environment reports it; together they must be the batch asked for."""
+def _render_of(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What ``--env-arg render=...`` says, to which the other options are added."""
+    given = arguments.get("render", {})
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"render={given!r}: expected a mapping of RenderConfig's fields")
+    return given
+
+
+def slots_of(info: ResetInfo, expected: Sequence[Episode]) -> list[Episode]:
+    """The episode in each slot, as the environment reports it; together they must be those asked for."""
     numbers = [int(text.rsplit("/", 1)[1]) for text in info.episode_id]
     slots = [Episode(info.suite, int(task), number) for task, number in zip(info.task_id, numbers, strict=True)]
-    if sorted(slots) != sorted(batch.slots):
-        raise RuntimeError(f"the environment placed {len(slots)} other episodes than the {len(batch)} asked for")
+    if sorted(slots) != sorted(expected):
+        raise RuntimeError(f"the environment placed {len(slots)} other episodes than the {len(expected)} asked for")
     return slots

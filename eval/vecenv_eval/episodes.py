@@ -7,13 +7,27 @@ episodes, at most ``num_envs`` slots each, tasks that share a scene side by side
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import groupby, pairwise, product
+from dataclasses import dataclass, field
+from itertools import groupby, islice, pairwise, product
 
 from vecenv.placement import ALL, SpecError, parse_episodes, parse_tasks
 
-__all__ = ["ALL", "MAX_SLOTS", "Batch", "Episode", "SpecError", "Suite", "parse_episodes", "parse_tasks", "plan"]
+__all__ = [
+    "ALL",
+    "MAX_SLOTS",
+    "Batch",
+    "Episode",
+    "SpecError",
+    "Stream",
+    "Suite",
+    "parse_episodes",
+    "parse_tasks",
+    "plan",
+    "streams",
+]
 
+# Scenes of a suite that run side by side; drawing one takes up to 0.9 GB.
+MAX_SCENES = 5
 # Most episodes that run at once, where neither the user nor the suite sets another number.
 MAX_SLOTS = 256
 
@@ -137,3 +151,92 @@ def _even_chunks(items: Sequence[int], most: int) -> Iterator[tuple[int, ...]]:
     bounds = [len(items) * i // count for i in range(count + 1)]
     for start, stop in pairwise(bounds):
         yield tuple(items[start:stop])
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Episodes that run in one environment: those that its slots begin with, and those that follow.
+
+    Attributes:
+        suite: name of the suite.
+        first: the episode that each slot begins with, tasks side by side.
+        waiting: scene -> episodes of its tasks that follow, as slots of the scene end.
+    """
+
+    suite: str
+    first: tuple[Episode, ...]
+    waiting: Mapping[Hashable, tuple[Episode, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, batch: Batch) -> Stream:
+        """A batch, which nothing follows."""
+        return cls(batch.suite, batch.slots)
+
+    @property
+    def tasks(self) -> tuple[int, ...]:
+        """The tasks that slots begin with, each once, in the order of the slots."""
+        return tuple(dict.fromkeys(episode.task for episode in self.first))
+
+    @property
+    def episodes(self) -> tuple[Episode, ...]:
+        """All of them."""
+        return (*self.first, *(episode for waiting in self.waiting.values() for episode in waiting))
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+
+def streams(
+    suite: Suite,
+    tasks: Sequence[int],
+    episodes: Mapping[int, Sequence[int]],
+    *,
+    num_envs: int,
+    done: Collection[Episode] = (),
+) -> list[Stream]:
+    """Put episodes into streams of at most ``num_envs`` slots and ``MAX_SCENES`` scenes each.
+
+    A scene gets slots in proportion to its episodes, and at least one.
+
+    Args:
+        suite: the suite, for which tasks share a scene.
+        tasks: task indices; they are ordered by scene.
+        episodes: episode indices by task.
+        num_envs: most slots of a stream.
+        done: episodes to leave out.
+    """
+    if num_envs < 1:
+        raise SpecError(f"num_envs must be at least 1, not {num_envs}")
+    done = frozenset(done)
+    todo: dict[Hashable, list[Episode]] = {}
+    for task in _by_scene(suite, tasks):
+        missing = [each for each in (Episode(suite.name, task, e) for e in episodes[task]) if each not in done]
+        if missing:
+            todo.setdefault(suite.scenes[task], []).extend(missing)
+    return [_stream(suite, some, todo, num_envs) for some in _chunks(list(todo), min(MAX_SCENES, num_envs))]
+
+
+def _stream(suite: Suite, scenes: Sequence[Hashable], todo: Mapping[Hashable, list[Episode]], num_envs: int) -> Stream:
+    counts = _shares([len(todo[scene]) for scene in scenes], num_envs)
+    first = [episode for scene, count in zip(scenes, counts, strict=True) for episode in todo[scene][:count]]
+    waiting = {scene: tuple(todo[scene][count:]) for scene, count in zip(scenes, counts, strict=True)}
+    return Stream(suite.name, tuple(first), waiting)
+
+
+def _shares(wanted: Sequence[int], most: int) -> list[int]:
+    """Slots of each scene: all that are wanted if they fit, else in proportion, one at least, ``most`` together."""
+    if sum(wanted) <= most:
+        return list(wanted)
+    shares = [max(1, count * most // sum(wanted)) for count in wanted]
+    while sum(shares) > most:
+        shares[shares.index(max(shares))] -= 1
+    while sum(shares) < most:
+        shares[max(range(len(wanted)), key=lambda i: wanted[i] / shares[i])] += 1
+    return shares
+
+
+def _chunks(items: Sequence[Hashable], most: int) -> Iterator[tuple[Hashable, ...]]:
+    """The items in chunks of ``most``, the last perhaps shorter."""
+    rest = iter(items)
+    while chunk := tuple(islice(rest, most)):
+        yield chunk

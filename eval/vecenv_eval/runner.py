@@ -1,7 +1,7 @@
 """Evaluate a policy on a suite: check the config, run what has no verdict yet, summarise.
 
 An :class:`~vecenv_eval.config.EvalConfig` and a results folder come in; :class:`Evaluation` refuses what cannot run
-before anything is built, plans the batches, runs them (``vecenv_eval.batches``) and returns an
+before anything is built, plans the batches, runs them (``vecenv_eval.loop``) and returns an
 :class:`~vecenv_eval.results.EvalResult`.
 """
 
@@ -14,11 +14,11 @@ from pathlib import Path
 from vecenv import family, protocols
 from vecenv.errors import VecenvError
 from vecenv.placement import episode_indices
-from vecenv_eval.batches import BatchLoop
 from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
 from vecenv_eval.environments import make_arguments
-from vecenv_eval.episodes import ALL, Batch, Episode, Suite, parse_tasks, plan
-from vecenv_eval.policies import make_policy
+from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
+from vecenv_eval.loop import EpisodeLoop
+from vecenv_eval.policies import Closing, Refillable, make_policy
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.report import markdown, summarise
 from vecenv_eval.results import EvalResult, Progress, begin
@@ -77,10 +77,12 @@ class Evaluation:
         """Every episode asked for, task by task."""
         return tuple(Episode(self.suite.name, task, e) for task in self.tasks for e in self.episodes[task])
 
-    def batches(self, done: Collection[Episode] = ()) -> list[Batch]:
-        """The batches that run every planned episode but those in ``done``."""
+    def streams(self, done: Collection[Episode] = ()) -> list[Stream]:
+        """What runs the planned episodes but those in ``done``; batches, if the policy cannot begin single slots."""
         most = self.suite.max_slots if self.config.num_envs is None else self.config.num_envs
-        return plan(self.suite, self.tasks, self.episodes, num_envs=most, done=done)
+        if isinstance(self.policy, Refillable):
+            return streams(self.suite, self.tasks, self.episodes, num_envs=most, done=done)
+        return [Stream.of(b) for b in plan(self.suite, self.tasks, self.episodes, num_envs=most, done=done)]
 
     def run(self, store: ResultStore, on_progress: Callable[[Progress], None] = lambda progress: None) -> EvalResult:
         """Run what the store does not have yet.
@@ -92,7 +94,7 @@ class Evaluation:
         """
         content = store.config()
         store.write_config({**content, "runs": [*content["runs"], run_conditions()]})
-        loop = BatchLoop(
+        loop = EpisodeLoop(
             self.config,
             self.suite,
             self.policy,
@@ -103,11 +105,18 @@ class Evaluation:
             index=len(content["runs"]),
         )
         try:
-            interrupted = loop.run(self.batches(store.done()))
+            interrupted = loop.run(self.streams(store.done()), self._again)
         except ConfigError:
             store.discard()
             raise
+        finally:
+            if isinstance(self.policy, Closing):
+                self.policy.close()
         return self._summarise(store, interrupted, tuple(loop.causes))
+
+    def _again(self, episodes: Collection[Episode]) -> list[Stream]:
+        """Streams of these episodes alone."""
+        return self.streams(done=frozenset(self.planned) - frozenset(episodes))
 
     def _summarise(self, store: ResultStore, interrupted: bool, causes: tuple[str, ...]) -> EvalResult:
         """Write the summary of all records in the folder, and return it with them."""

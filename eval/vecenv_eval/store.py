@@ -23,6 +23,8 @@ from vecenv_eval.episodes import Episode
 
 CONFIG, EPISODES, ERRORS, SUMMARY, REPORT = "config.json", "episodes.jsonl", "errors.log", "summary.json", "report.md"
 DEMOS = "demos"
+# Fields of a record that may differ when an episode is run again.
+CIRCUMSTANCES = frozenset({"run", "batch", "setup_s", "wall_s", "policy_s", "physics_s", "images_s"})
 # Where results folders go unless something else is asked for.
 RESULTS = Path("results")
 
@@ -45,10 +47,13 @@ class Record:
         reward: sum of rewards, None when it was not finite.
         fault: why the slot was quarantined, "" when it was healthy. Such an episode counts as a failure.
         error: why the episode has no verdict (an exception in its batch), "" when it has one.
+        sanitized: calls of the policy whose actions held non-finite values or values out of range.
+        sanitized_first: the control tick of the first of them, None when there was none.
         run: which run on this folder, 0 for the first, one more at each resume.
-        batch: which batch of that run.
-        setup_s: seconds it took to place the batch (building or re-placing the environment, and reset).
+        batch: which stream of episodes of that run.
+        setup_s: seconds it took to place the episode (building or re-placing the environment, and reset).
         wall_s: seconds from then until this episode ended, the policy's included.
+        policy_s, physics_s, images_s: its share of what its batch spent in the policy, in physics and in rendering.
         extras: what the policy reports about the episode, numbers and texts by name.
         stand_ins: a sentence for each file that was missing and what was used instead.
     """
@@ -62,14 +67,24 @@ class Record:
     reward: float | None
     fault: str = ""
     error: str = ""
+    sanitized: int = 0
+    sanitized_first: int | None = None
     run: int = 0
     batch: int = 0
     setup_s: float = 0.0
     wall_s: float = 0.0
+    policy_s: float = 0.0
+    physics_s: float = 0.0
+    images_s: float = 0.0
     extras: Mapping[str, Any] = field(default_factory=dict)
     stand_ins: tuple[str, ...] = ()
     success_first: bool = False
     success_final: bool = False
+
+    @property
+    def verdict(self) -> dict[str, Any]:
+        """What belongs to the episode alone: everything but when, where and how fast it ran."""
+        return {name: value for name, value in asdict(self).items() if name not in CIRCUMSTANCES}
 
     @property
     def key(self) -> Episode:

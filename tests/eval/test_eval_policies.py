@@ -91,7 +91,12 @@ def test_a_users_own_policy_goes_by_module_and_class(my_module: str) -> None:
     ("name", "arguments", "says"),
     [
         ("rando", {}, "unknown policy 'rando': did you mean random"),
-        ("qqq", {}, "unknown policy 'qqq': did you mean pick_place, random, simpler_scripted, voxposer, zero"),
+        (
+            "qqq",
+            {},
+            "unknown policy 'qqq': did you mean gr00t, openpi, pick_place, random, simpler_scripted, starvla, "
+            "vla-eval, voxposer, zero",
+        ),
         ("module:", {}, "unknown policy 'module:'"),
         ("no_such_module:Class", {}, "importing 'no_such_module' failed: ModuleNotFoundError"),
         ("a_broken_module:Class", {}, "ModuleNotFoundError: No module named 'no_such_thing_anywhere'"),

@@ -20,10 +20,11 @@ from vecenv_eval.runner import Evaluation, evaluate
 from vecenv_eval.store import ResultStore, StoreError
 
 from vecenv.contract import BatchEnv, Control, ResetInfo
+from vecenv.errors import NotFound
 
 
-class UnknownScene(KeyError):
-    """As libraries raise it on purpose, unlike a bare KeyError."""
+class UnknownScene(NotFound, KeyError):
+    """As vecenv raises it, unlike a bare KeyError, which is an accident."""
 
 
 class Scripted:
@@ -64,6 +65,12 @@ def use_policy(monkeypatch: pytest.MonkeyPatch, policy: Any) -> None:
     monkeypatch.setattr(policies, "_load", lambda name: lambda: policy)
 
 
+@pytest.fixture
+def in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The policy cannot begin single slots, so episodes run in batches."""
+    use_policy(monkeypatch, Scripted(lambda env: np.zeros((env.num_envs, 7))))
+
+
 def test_every_episode_gets_the_environments_verdict(folder: Path) -> None:
     result = run(folder, FakeWorld())
     assert result.ok
@@ -95,6 +102,7 @@ def test_only_what_was_asked_for_runs(folder: Path) -> None:
     ]
 
 
+@pytest.mark.usefixtures("in_batches")
 def test_the_environment_is_placed_anew_as_long_as_slots_keep_their_scene(folder: Path) -> None:
     world = FakeWorld()
     run(folder, world, num_envs=5)
@@ -132,6 +140,7 @@ def test_a_faulted_episode_is_a_failure_with_its_cause(folder: Path) -> None:
     assert (result.summary.total.faults, result.summary.total.successes, result.summary.total.episodes) == (1, 9, 20)
 
 
+@pytest.mark.usefixtures("in_batches")
 def test_a_batch_that_raises_costs_its_unfinished_episodes_only(folder: Path) -> None:
     result = run(folder, FakeWorld(raise_in={0: ValueError("the sky fell\nin pieces")}), num_envs=5)
     errors = {r.key: r.error for r in result.records if r.error}
@@ -141,11 +150,13 @@ def test_a_batch_that_raises_costs_its_unfinished_episodes_only(folder: Path) ->
     assert "in pieces" in (folder / "errors.log").read_text()
 
 
+@pytest.mark.usefixtures("in_batches")
 def test_a_run_can_stop_at_the_first_error(folder: Path) -> None:
     result = run(folder, FakeWorld(raise_in={0: ValueError("boom")}), num_envs=5, fail_fast=True)
     assert (result.summary.total.errors, result.summary.total.missing) == (4, 15)
 
 
+@pytest.mark.usefixtures("in_batches")
 def test_resuming_tries_again_what_failed_and_only_that(folder: Path) -> None:
     run(folder, FakeWorld(raise_in={0: ValueError("boom")}), num_envs=5)
     world = FakeWorld()
@@ -156,6 +167,7 @@ def test_resuming_tries_again_what_failed_and_only_that(folder: Path) -> None:
     assert len(json.loads((folder / "config.json").read_text())["runs"]) == 2
 
 
+@pytest.mark.usefixtures("in_batches")
 def test_ctrl_c_keeps_what_was_computed(folder: Path) -> None:
     result = run(folder, FakeWorld(raise_in={2: KeyboardInterrupt()}), num_envs=5)
     assert result.interrupted
@@ -215,6 +227,7 @@ def test_an_environment_that_breaks_while_it_is_built_is_an_error_of_its_batch(f
     assert result.summary.total.errors == 20
 
 
+@pytest.mark.usefixtures("in_batches")
 def test_progress_counts_up_to_every_episode(folder: Path) -> None:
     progress: list[Progress] = []
     run(folder, FakeWorld(faults={(1, 0): "f"}), progress, num_envs=10)

@@ -17,10 +17,11 @@ from vecenv_eval.policies.pick_place.motion import (
 from vecenv_eval.policies.pick_place.policy import PickPlacePolicy
 
 import vecenv
-from vecenv.contract import BatchEnv, Egocentric, Metrics, Objects, ObjectsSnapshot, PointCloud, ResetInfo
+from vecenv.contract import BatchEnv, Metrics, ResetInfo
 from vecenv.manipulation.grasps import Gripper, clearance, find_grasps
 from vecenv.manipulation.placing import choose_grasp
 from vecenv.manipulation.world import HOME_ROTATION, Margins, SceneGeometry, down_facing, yaw
+from vecenv.observations import Egocentric, Objects, ObjectsSnapshot, PointCloud
 
 Cloud = tuple[np.ndarray, np.ndarray]
 

@@ -16,7 +16,8 @@ from vecenv_eval.policies.simpler.grasps import choose
 from vecenv_eval.policies.simpler.reach import HANDS, Arm
 
 from vecenv import make
-from vecenv.contract import Control, Part, PartJoint, PointCloud
+from vecenv.contract import Control
+from vecenv.observations import Part, PartJoint, PointCloud
 from vecenv.simpler.control.controllers import controller
 from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX
 from vecenv.simpler.control.rotations import rotation_from_rotvec

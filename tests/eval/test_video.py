@@ -87,7 +87,8 @@ def test_what_cannot_be_tiled_is_refused(images: Any, options: dict[str, Any], m
 
 def frames_of(path: Path) -> list[np.ndarray]:
     imageio = pytest.importorskip("imageio")
-    return list(imageio.get_reader(path).iter_data())
+    with imageio.get_reader(path) as reader:
+        return list(reader.iter_data())
 
 
 def test_a_video_has_its_frames(tmp_path: Path) -> None:

@@ -8,47 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.libero_batch import STILL, make, put_target_in_basket, still, wiggle
 
 import vecenv
 from vecenv.actions import ActionError
-from vecenv.contract import BatchEnv, ImagesUnavailable
+from vecenv.contract import BatchEnv
 from vecenv.libero.env import LiberoEnv, LiberoError
 from vecenv.libero.scene import elements
 from vecenv.libero.tasks import sources
+from vecenv.observations import ImagesUnavailable
 from vecenv.placement import PlacementError
-
-STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
-
-
-def make(suite: str = "libero_object", **options: Any) -> LiberoEnv:
-    options = {"task": 1, "episodes": range(3), "start": "raw", "settle_steps": 0, **options}
-    if "tasks" in options:
-        del options["task"]
-    env = vecenv.make(suite, **options)
-    assert isinstance(env, LiberoEnv)
-    return env
-
-
-def still(env: LiberoEnv) -> np.ndarray:
-    return np.tile(STILL, (env.num_envs, 1))
-
-
-def wiggle(env: LiberoEnv, seed: int = 0, ticks: int = 4) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-1, 1, (env.num_envs, ticks, 7))
-
-
-def put_target_in_basket(env: LiberoEnv, slots: list[int]) -> None:
-    """Overwrite the state so that the target object floats just above the floor of the basket."""
-    state = env.state()
-    snapshots = env.observe_objects().snapshot
-    for slot in slots:
-        snapshot = snapshots[slot]
-        assert snapshot is not None
-        _, target, region = snapshot.goal[0]
-        model = env.mj_models[env.scene_index[slot]]
-        address = model.joint(f"{target}_joint0").qposadr[0]
-        state.qpos[slot, address : address + 3] = snapshot.regions[region].pos
-    env.set_state(state)
 
 
 @pytest.fixture
@@ -397,79 +366,6 @@ class TestObservations:
     def test_an_unknown_kind_of_points_is_refused(self, env: LiberoEnv) -> None:
         with pytest.raises(LiberoError, match="surface"):
             env.observe_objects(points="voxels")
-
-
-class TestEePose:
-    def test_slots_converge_each_on_its_own(self, env: LiberoEnv) -> None:
-        start = env.step_ee_pose([]).final_pose
-        target = np.concatenate([start, np.zeros((3, 1))], axis=1)
-        target[:, 2] -= [0.0, 0.03, 0.09]
-        control = env.step_ee_pose(target)
-        assert control.converged.all()
-        assert control.error == ("", "", "")
-        assert 1 == control.step_count[0] < control.step_count[1] < control.step_count[2]
-        assert (np.linalg.norm(control.final_pose[:, :3] - target[:, :3], axis=1) < 0.01).all()
-
-    def test_no_tick_moves_further_than_allowed(self, env: LiberoEnv) -> None:
-        start = env.step_ee_pose([]).final_pose
-        target = np.concatenate([start, np.zeros((3, 1))], axis=1)
-        target[:, 0] += 0.2
-        control = env.step_ee_pose(target)
-        travelled = np.linalg.norm(control.final_pose[:, :3] - start[:, :3], axis=1)
-        assert (travelled <= 0.005 * control.step_count + 0.01).all()
-
-    def test_an_empty_action_is_a_no_op(self, env: LiberoEnv) -> None:
-        before = env.state().qpos
-        control = env.step_ee_pose([])
-        assert control.step_count.tolist() == [0, 0, 0]
-        assert not control.done.any()
-        np.testing.assert_array_equal(env.state().qpos, before)
-
-    def test_hold_steps_close_the_gripper_without_motion(self, env: LiberoEnv) -> None:
-        start = env.step_ee_pose([]).final_pose
-        target = np.concatenate([start, np.ones((3, 1))], axis=1)
-        control = env.step_ee_pose(target, hold_steps=[30, 0, 60])
-        assert control.step_count.tolist() == [30, 1, 60]
-        fingers = np.abs(env.observe_egocentric().state[:, 6:]).sum(axis=1)
-        assert fingers[2] < 0.002
-        assert fingers[1] > 0.03
-        np.testing.assert_allclose(control.final_pose[:, :3], start[:, :3], atol=0.01)
-
-    def test_pose_and_hold_may_come_as_a_mapping(self, env: LiberoEnv) -> None:
-        start = env.step_ee_pose([]).final_pose
-        target = np.concatenate([start, np.ones((3, 1))], axis=1)
-        assert env.step_ee_pose({"pose": target, "hold_steps": 2}).step_count.tolist() == [2, 2, 2]
-
-    def test_a_bad_pose_is_an_error_of_its_slot(self, env: LiberoEnv) -> None:
-        start = env.step_ee_pose([]).final_pose
-        target = np.concatenate([start, np.zeros((3, 1))], axis=1)
-        target[:, 2] -= 0.03
-        target[0, 3:7] = 0.0
-        target[1, 0] = np.nan
-        control = env.step_ee_pose(target)
-        assert control.error == ("quaternion has no length", "pose is not finite", "")
-        assert control.converged.tolist() == [False, False, True]
-        assert control.step_count[0] == control.step_count[1] == 0
-
-    def test_a_grasp_lifts_a_real_object(self) -> None:
-        env = make(episodes=[0], settle_steps=10)
-        env.reset()
-        snapshot = env.observe_objects().snapshot[0]
-        assert snapshot is not None
-        cheese = snapshot.objects["cream_cheese_1"].points
-        centre = (cheese.min(0) + cheese.max(0)) / 2
-        # Fingers close along the hand's y axis; this box is narrower along one horizontal side.
-        spread = np.cov(cheese[:, :2].T)
-        narrow = np.linalg.eigh(spread)[1][:, 0]
-        yaw = np.arctan2(narrow[1], narrow[0]) - np.pi / 2
-        down = np.array([0.0, np.cos(yaw / 2), np.sin(yaw / 2), 0.0])
-        for height, grip, hold in ((0.12, 0, 0), (0.0, 0, 0), (0.0, 1, 20), (0.15, 1, 0)):
-            pose = np.array([centre[0], centre[1], centre[2] + height, *down, grip])
-            control = env.step_ee_pose(pose[None], hold_steps=hold)
-            assert hold or control.converged.all()
-        lifted = env.observe_objects().snapshot[0]
-        assert lifted is not None
-        assert lifted.poses["cream_cheese_1"][2] > snapshot.poses["cream_cheese_1"][2] + 0.08
 
 
 class TestSurfaceOfThePackage:

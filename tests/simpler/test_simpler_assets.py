@@ -1,4 +1,4 @@
-"""SIMPLER's assets: verified, resumed, never outside their folder, and what stands in for missing files."""
+"""Fetching SIMPLER's assets: files are verified, downloads resume, and nothing is written outside the folder."""
 
 from __future__ import annotations
 
@@ -9,35 +9,25 @@ import json
 import tarfile
 import threading
 import zipfile
-from collections import defaultdict
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path, PurePosixPath
 
 import httpx
 import pytest
+from support.asset_server import CAN, FILES, Server, write
 from support.simpler_files import ARCHIVE
 from typer.testing import CliRunner
 
-from vecenv.assets import AssetsMissing
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.assets import pull
 from vecenv.simpler.assets.download import RetryPolicy, check_redirect
 from vecenv.simpler.assets.errors import FileNotInSource
-from vecenv.simpler.assets.files import Entry, Manifest, ManifestError, read_manifest, resolve, visual_mesh
+from vecenv.simpler.assets.files import Entry, Manifest, ManifestError, read_manifest, resolve
 from vecenv.simpler.assets.pull import Archive, PullError, Report
 from vecenv.simpler.cli import assets_app
-from vecenv.simpler.models import model_folder
-from vecenv.simpler.tasks import TASKS
 
 QUICK = RetryPolicy(attempts=3, connect=1.0, read=0.3, wait=0.0)
 ONCE = RetryPolicy(attempts=1, connect=1.0, read=0.3, wait=0.0)
-FILES = {
-    "data/custom/models/can/collision.obj": b"v 0 0 0\n" * 4000,
-    "data/custom/models/can/textured.dae": b"<COLLADA/>" * 3000,
-    "robots/arm.urdf": b"<robot/>",
-}
-CAN = "data/custom/models/can/collision.obj"
 
 
 def entry(path: str, content: bytes) -> Entry:
@@ -48,94 +38,10 @@ def listed(files: dict[str, bytes]) -> Manifest:
     return Manifest(commit="c0ffee", files=tuple(entry(path, content) for path, content in files.items()))
 
 
-def write(folder: Path, files: dict[str, bytes]) -> Path:
-    for path, content in files.items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(content)
-    return folder
-
-
 def held(folder: Path) -> dict[str, bytes]:
     """What lies in a folder, downloads that were begun left out."""
     files = {file.relative_to(folder): file for file in folder.rglob("*") if file.is_file()}
     return {path.as_posix(): file.read_bytes() for path, file in files.items() if path.parts[0] != ".partial"}
-
-
-class Server(ThreadingHTTPServer):
-    """Serves ``files``; ``tricks`` says, path by path, what to do with the next requests instead of serving."""
-
-    daemon_threads = True
-
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), Handler)
-        self.files: dict[str, bytes] = {}
-        self.tricks: dict[str, list[str]] = defaultdict(list)
-        self.always: dict[str, str] = {}
-        self.asked: list[tuple[str, str | None]] = []
-        self.over = threading.Event()
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}"
-
-    def ranges(self, path: str) -> list[str | None]:
-        """The range of every request for a path."""
-        return [asked for name, asked in self.asked if name == path]
-
-
-class Handler(BaseHTTPRequestHandler):
-    """One request."""
-
-    protocol_version = "HTTP/1.1"
-    server: Server
-
-    def do_GET(self) -> None:
-        path, begins = self.path.lstrip("/"), self.headers.get("Range")
-        self.server.asked.append((path, begins))
-        tricks = self.server.tricks[path]
-        trick = tricks.pop(0) if tricks else self.server.always.get(path, "serve")
-        if trick.startswith("redirect "):
-            self._head(302, 0, Location=trick.removeprefix("redirect "))
-        elif trick.startswith("status "):
-            self._head(int(trick.removeprefix("status ")), 0)
-        elif path not in self.server.files:
-            self._head(404, 0)
-        else:
-            self._serve(self.server.files[path], int(begins[6:-1]) if begins else 0, trick)
-
-    def _serve(self, content: bytes, begin: int, trick: str) -> None:
-        if trick == "ignore range":
-            begin = 0
-        if begin >= len(content):
-            return self._head(416, 0)
-        rest = content[begin:]
-        if trick == "corrupt":
-            rest = bytes([rest[0] ^ 1]) + rest[1:]
-        if trick == "too long":
-            rest += b"more"
-        if trick == "too short":
-            rest = rest[: len(rest) // 2]
-        if begin or trick == "elsewhere":
-            self._head(206, len(rest), **{"Content-Range": f"bytes {7 if trick == 'elsewhere' else begin}-9/9"})
-        else:
-            self._head(200, len(rest))
-        if trick in ("truncate", "stall"):
-            self.wfile.write(rest[: len(rest) // 2])
-            self.wfile.flush()
-            if trick == "stall":
-                self.server.over.wait(10)
-            self.close_connection = True
-        else:
-            self.wfile.write(rest)
-
-    def _head(self, status: int, length: int, **fields: str) -> None:
-        self.send_response(status)
-        for name, value in {"Content-Length": str(length), **fields}.items():
-            self.send_header(name, value)
-        self.end_headers()
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Stay silent."""
 
 
 @pytest.fixture
@@ -470,95 +376,6 @@ def test_a_file_needs_a_hash(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text('{"commit": "c0ffee", "files": [{"path": "a", "size": 1}]}')
     with pytest.raises(ManifestError, match="a has no hash"):
         read_manifest(tmp_path / "manifest.json")
-
-
-# The package's manifest
-
-
-def test_the_manifest_lists_whatever_the_tasks_open() -> None:
-    paths = set(read_manifest().by_path)
-    for task in TASKS.values():
-        files = [task.stage.mesh, task.station, task.models_path, *task.overlays]
-        files += [task.robot.urdf_path(version) for version in task.robot.versions]
-        models = {*task.models}.union(*task.triplets)
-        files += [model_folder(model) / "collision.obj" for model in models]
-        assert {file for file in files if file} <= paths
-        for model in models:
-            assert any(model_folder(model) / name in paths for name in ("textured.dae", "textured.glb"))
-
-
-def test_files_without_a_hash_of_ours_all_have_stand_ins(tmp_path: Path) -> None:
-    manifest = read_manifest()
-    assert len(manifest.by_path) == len(manifest.files)
-    unknown = [entry.path for entry in manifest.files if not entry.sha256]
-    assert len(unknown) == 9
-    for path in unknown:
-        if path.name == "textured.dae":
-            write(tmp_path, {str(path.parent / "collision.obj"): b""})
-        assert str(path) in resolve(path, tmp_path).note
-
-
-# Resolving
-
-
-def test_a_file_that_is_there_has_no_stand_in(tmp_path: Path) -> None:
-    write(tmp_path, FILES)
-    found = resolve(CAN, tmp_path)
-    assert (found.path, found.stand_in, found.note) == (tmp_path / CAN, None, "")
-
-
-@pytest.mark.parametrize(
-    ("stage", "top", "certainty"),
-    [
-        ("bridge_table_1_v1", 0.869532, "published"),
-        ("bridge_table_1_v2", 0.869532, "unverified"),
-        ("google_pick_coke_can_1_v4", 0.887532, "published"),
-    ],
-)
-def test_a_missing_stage_becomes_a_table_of_its_height(stage: str, top: float, certainty: str, tmp_path: Path) -> None:
-    stand_in = resolve(f"data/hab2_bench_assets/stages/{stage}.glb", tmp_path).stand_in
-    assert stand_in is not None
-    assert (stand_in.kind, stand_in.top) == ("table", top)
-    assert f"{stage}.glb is missing" in stand_in.note
-    assert certainty in stand_in.note
-
-
-def test_a_missing_textured_mesh_is_replaced_by_the_collision_mesh(tmp_path: Path) -> None:
-    write(tmp_path, {"data/custom/models/eggplant/collision.obj": b""})
-    stand_in = visual_mesh("eggplant", tmp_path).stand_in
-    assert stand_in is not None
-    assert stand_in.mesh == tmp_path / "data/custom/models/eggplant/collision.obj"
-    assert "eggplant/textured.dae is missing" in stand_in.note
-
-
-def test_textured_meshes_are_looked_for_in_upstreams_order(tmp_path: Path) -> None:
-    folder = "data/custom/models/can"
-    for name in ("textured.glb", "textured.dae", "textured.obj"):
-        write(tmp_path, {f"{folder}/{name}": b""})
-        assert visual_mesh("can", tmp_path).path == tmp_path / folder / name
-
-
-@pytest.mark.parametrize("name", ["data/real_inpainting/x.png", "data/hab2_bench_assets/stages/moon.glb", CAN])
-def test_what_nothing_can_stand_in_for_is_missing(name: str, tmp_path: Path) -> None:
-    with pytest.raises(AssetsMissing, match="vecenv assets pull simpler"):
-        resolve(name, tmp_path)
-    with pytest.raises(AssetsMissing):
-        assets.collision_mesh("can", tmp_path)
-
-
-def test_the_tree_is_where_the_variable_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(assets.VARIABLE, str(tmp_path / "tree"))
-    with pytest.raises(AssetsMissing, match=r"tree.* is not a directory.*vecenv assets pull simpler"):
-        assets.simpler_root()
-    (tmp_path / "tree/data/custom").mkdir(parents=True)
-    row = assets.asset_row()
-    assert (row.ok, row.how_to_get.split(",")[0]) == (False, "vecenv assets pull simpler")
-    assert "has no mani_skill2_real2sim/assets/descriptions" in row.problem
-    (tmp_path / "tree/mani_skill2_real2sim/assets/descriptions").mkdir(parents=True)
-    assert assets.simpler_root() == tmp_path / "tree"
-    row = assets.asset_row()
-    assert (row.ok, row.path, row.problem) == (True, tmp_path / "tree", "")
-    assert any("bridge_table_1_v1.glb is missing" in note for note in assets.stand_ins())
 
 
 # Command line

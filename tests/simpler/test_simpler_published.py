@@ -309,10 +309,13 @@ def test_the_command_pulls_variants_alone(tmp_path: Path) -> None:
 def made(root: Path, protocol: str, task: Any, rows: Any, **options: Any) -> SimplerEnv:
     pytest.importorskip("sapien")
     from vecenv import make
+    from vecenv.simpler import env as simpler_env
 
     tasks = [task] if isinstance(task, str) else task
     suite = TASKS[tasks[0]].suite
-    return make(suite, tasks=tasks, protocol=protocol, episodes=rows, assets=root, num_threads=1, **options)
+    env = make(suite, tasks=tasks, protocol=protocol, episodes=rows, assets=root, num_threads=1, **options)
+    assert isinstance(env, simpler_env.SimplerEnv)
+    return env
 
 
 def batch(root: Path, protocol: str, task: str, rows: Sequence[int]) -> SimplerEnv:
@@ -377,7 +380,7 @@ def test_episodes_are_chosen_from_the_list_and_no_further(small: Path) -> None:
         made(small, AGGREGATION, OBJECT, [0])
     with pytest.raises(PublishedError, match="available: visual-matching, variant-aggregation, seed"):
         made(small, "published", COKE, [0])
-    with pytest.raises(ValueError, match="protocol 'visual-matching' says itself what varies"):
+    with pytest.raises(ValueError, match="protocol 'visual-matching' already decides the variants"):
         made(small, MATCHING, COKE, [0], variant={"camera": "lower"})
 
 
@@ -402,7 +405,7 @@ def test_a_table_that_is_not_there_is_named(small: Path) -> None:
     assert len(named) == 4
 
 
-def test_a_room_that_is_not_there_is_named_by_its_pictures_and_physics_runs(small: Path) -> None:
+def test_a_room_that_is_not_there_is_named_by_its_images_and_physics_runs(small: Path) -> None:
     env = batch(small, AGGREGATION, "google_robot_open_top_drawer", [0, 62])
     assert env.step_continuous(np.zeros((2, 7))).info["fault"] == ("", "")
     seen = env.observe_egocentric()
@@ -432,7 +435,7 @@ def test_objects_come_to_rest_where_upstreams_do(original: Path, protocol: str, 
 
 
 @pytest.mark.heavy  # a CPU compiles shaders for a quarter of a minute
-def test_pictures_of_variant_aggregation_show_the_drawn_scene_and_its_light(small: Path) -> None:
+def test_images_of_variant_aggregation_show_the_rendered_scene_and_its_light(small: Path) -> None:
     """Beside them, visual matching's show the photograph."""
     pytest.importorskip("sapien")
     from vecenv.simpler import overlay

@@ -12,7 +12,8 @@ import numpy as np
 from vecenv_eval.episodes import Suite
 from vecenv_eval.simulator import Simulator
 
-from vecenv.contract import Control, EePoseControl, Egocentric, Metrics, Objects, PlanControl, ResetInfo
+from vecenv.contract import Control, EePoseControl, Metrics, PlanControl, ResetInfo
+from vecenv.observations import Egocentric, Objects
 
 SUITE = "fake_suite"
 
@@ -23,13 +24,15 @@ class FakeEnv:
     def __init__(
         self,
         tasks: Sequence[int],
-        episodes: Sequence[int],
+        episodes: Sequence[int] | Mapping[int, Sequence[int]],
         *,
         max_steps: int = 10,
         faults: Mapping[tuple[int, int], str] | None = None,
         raise_in: Mapping[int, BaseException] | None = None,
     ) -> None:
-        self.tasks, self.episodes = [np.array(x) for x in zip(*((t, e) for t in tasks for e in episodes), strict=True)]
+        by_task = episodes if isinstance(episodes, Mapping) else dict.fromkeys(tasks, episodes)
+        pairs = [(task, episode) for task in tasks for episode in by_task[task]]
+        self.tasks, self.episodes = [np.array(column) for column in zip(*pairs, strict=True)]
         self.num_envs = len(self.tasks)
         self.max_steps, self.faults, self.raise_in = max_steps, faults or {}, raise_in or {}
         self.closed, self.placements = False, 1
@@ -50,7 +53,11 @@ class FakeEnv:
             max_steps=np.full(self.num_envs, self.max_steps),
         )
 
-    def set_episodes(self, *, tasks: Any = None, episodes: Any = None) -> None:
+    def set_episodes(self, *, tasks: Any = None, episodes: Any = None, slots: Any = None) -> None:
+        if slots is not None:
+            self.tasks[slots], self.episodes[slots] = tasks, episodes
+            self.ticks[slots], self.terminated[slots], self.truncated[slots] = 0, False, False
+            return
         assert len(tasks) == len(episodes) == self.num_envs
         self.tasks, self.episodes = np.array(tasks), np.array(episodes)
         self.placements += 1
@@ -108,10 +115,10 @@ class FakeEnv:
         control = self.step_continuous(np.zeros((self.num_envs, 7)))
         return PlanControl(**vars(control), error=("",) * self.num_envs)
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
         return Egocentric(state=np.zeros((self.num_envs, 8), np.float32))
 
-    def observe_objects(self, points: str = "surface") -> Objects:
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
         return Objects(snapshot=(None,) * self.num_envs, error=("a fake has no objects",) * self.num_envs)
 
     def close(self) -> None:

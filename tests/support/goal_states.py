@@ -11,6 +11,7 @@ import copy
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -46,7 +47,7 @@ class Simulation:
         self.data.qpos[:] = qpos
         mujoco.mj_forward(self.model, self.data)
 
-    def reads(self, states: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    def reads(self, states: Sequence[np.ndarray]) -> dict[str, Any]:
         """The arguments of ``goals.evaluate`` for n states."""
         fields: dict[str, list[np.ndarray]] = {name: [] for name in ("xpos", "site_xpos", "site_xmat", "qpos", "touch")}
         for state in states:

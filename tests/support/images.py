@@ -12,10 +12,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import vecenv
-from vecenv.contract import Egocentric
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.render import gl
 from vecenv.libero.render.options import POLICY_CAMERAS, RenderConfig
+from vecenv.observations import Egocentric
 
 
 def can_draw() -> bool:

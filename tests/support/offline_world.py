@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot, RegionBox
+from vecenv.observations import ObjectsSnapshot, RegionBox
 from voxposer.language.llm import LlmConfig
 from voxposer.language.lmp import build_lmps
 from voxposer.language.observations import DynamicObservation, LazyMap, Observation

@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from vecenv.controllers.osc import ArmState, OscGoal
-from vecenv.controllers.osc_numba import ARM_FIELDS, ARM_SIZE, ArmViews, Controllers
+from vecenv.controllers.osc_kernels import ARM_FIELDS, ARM_SIZE
+from vecenv.controllers.osc_numba import ArmViews, Controllers
 from vecenv.controllers.waypoint import Pose
 from vecenv.util.rotations import mat_to_quat
 

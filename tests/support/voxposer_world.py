@@ -7,19 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import (
-    Control,
-    Egocentric,
-    Metrics,
-    Objects,
-    ObjectsSnapshot,
-    Part,
-    PartJoint,
-    PlanControl,
-    PointCloud,
-    RegionBox,
-    ResetInfo,
-)
+from vecenv.contract import Control, Metrics, PlanControl, ResetInfo
+from vecenv.observations import Egocentric, Objects, ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 
 HOME = np.array([0.0, 0.0, 0.4, 0.0, 1.0, 0.0, 0.0])
 
@@ -88,11 +77,11 @@ class Obedient:
         b = self.num_envs
         return ResetInfo(("",) * b, ("s/0/0",) * b, "s", np.zeros(b, int), np.full(b, self._budget))
 
-    def observe_objects(self, points: str = "surface") -> Objects:
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
         del points
         return Objects(tuple(self.snapshots), ("",) * self.num_envs)
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
         return Egocentric(np.zeros((self.num_envs, 8), np.float32))
 
     def step_waypoints(self, plan: Any, max_misses: int | None = None) -> PlanControl:

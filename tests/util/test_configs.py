@@ -61,6 +61,6 @@ def test_numpy_scalars_are_numbers() -> None:
         ({"flag": 1}, "flag.*bool"),
     ],
 )
-def test_other_names_and_types_are_refused_with_what_is_right(fields: dict[str, object], says: str) -> None:
+def test_other_names_and_types_are_refused_with_what_is_right(fields: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         build(**fields)

@@ -123,7 +123,7 @@ PASSING = {
 
 
 @pytest.mark.parametrize("answer", PASSING.values(), ids=PASSING)
-def test_a_failure_that_passes_is_waited_out(server: LlmServer, config: LlmConfig, answer: Answer) -> None:
+def test_transient_failures_are_retried(server: LlmServer, config: LlmConfig, answer: Answer) -> None:
     server.say(answer, answer, "x = 1")
     model = Model(config)
     assert model.complete(QUESTION).text == "x = 1"
@@ -131,7 +131,7 @@ def test_a_failure_that_passes_is_waited_out(server: LlmServer, config: LlmConfi
     assert model.usage == Usage(calls=1, retries=2, prompt_tokens=11, completion_tokens=7, unpriced=1)
 
 
-def test_pauses_double_and_have_a_bit_of_chance_in_them(server: LlmServer, config: LlmConfig) -> None:
+def test_pauses_double_with_random_jitter(server: LlmServer, config: LlmConfig) -> None:
     server.say(failure(500, "oops"))
     model = Model(config)
     with pytest.raises(LlmError, match=r"openai/local: .*oops"):
@@ -142,16 +142,14 @@ def test_pauses_double_and_have_a_bit_of_chance_in_them(server: LlmServer, confi
 
 
 @pytest.mark.parametrize(("asked", "waited"), [("7", 7.0), ("0.5", 0.5), ("9999", 60.0), ("-3", 0.0)])
-def test_a_server_that_asks_for_a_pause_gets_it(
-    server: LlmServer, config: LlmConfig, asked: str, waited: float
-) -> None:
+def test_retry_after_in_seconds_is_honoured(server: LlmServer, config: LlmConfig, asked: str, waited: float) -> None:
     server.say(failure(429, "slow down", Retry_After=asked), "x = 1")
     model = Model(config)
     model.complete(QUESTION)
     assert model.pauses == [waited]
 
 
-def test_a_server_may_ask_for_a_pause_until_a_date(server: LlmServer, config: LlmConfig) -> None:
+def test_retry_after_as_a_date_is_honoured(server: LlmServer, config: LlmConfig) -> None:
     then = format_datetime(datetime.now(UTC) + timedelta(seconds=40), usegmt=True)
     server.say(failure(503, "busy", Retry_After=then), "x = 1")
     model = Model(config)
@@ -159,21 +157,21 @@ def test_a_server_may_ask_for_a_pause_until_a_date(server: LlmServer, config: Ll
     assert 20 < model.pauses[0] <= 41
 
 
-def test_a_pause_that_makes_no_sense_is_ours(server: LlmServer, config: LlmConfig) -> None:
+def test_an_invalid_retry_after_falls_back_to_the_default_pause(server: LlmServer, config: LlmConfig) -> None:
     server.say(failure(429, "slow down", Retry_After="soon"), "x = 1")
     model = Model(config)
     model.complete(QUESTION)
     assert 2 <= model.pauses[0] <= 3
 
 
-def test_a_server_that_does_not_answer_in_time_is_asked_again(server: LlmServer, config: LlmConfig) -> None:
+def test_timeouts_are_retried(server: LlmServer, config: LlmConfig) -> None:
     server.say(HANG, "x = 1")
     model = Model(replace(config, timeout_s=0.3))
     assert model.complete(QUESTION).text == "x = 1"
     assert model.usage.retries == 1
 
 
-def test_a_server_that_is_not_there_is_named_after_all_attempts(config: LlmConfig) -> None:
+def test_an_unreachable_server_is_reported_after_all_attempts(config: LlmConfig) -> None:
     model = Model(replace(config, api_base="http://127.0.0.1:9/v1"))
     with pytest.raises(LlmError, match="openai/local: ") as caught:
         model.complete(QUESTION)
@@ -185,7 +183,7 @@ def test_a_server_that_is_not_there_is_named_after_all_attempts(config: LlmConfi
 
 
 @pytest.mark.parametrize("status", [400, 401, 403, 404])
-def test_a_refusal_is_told_at_once(server: LlmServer, config: LlmConfig, status: int) -> None:
+def test_client_errors_are_not_retried(server: LlmServer, config: LlmConfig, status: int) -> None:
     server.say(failure(status, "no such key"))
     model = Model(config)
     with pytest.raises(LlmError, match="no such key") as caught:
@@ -196,7 +194,7 @@ def test_a_refusal_is_told_at_once(server: LlmServer, config: LlmConfig, status:
     assert "secret" not in str(caught.value)
 
 
-def test_an_answer_that_is_cut_off_is_an_error_that_says_what_to_raise(server: LlmServer, config: LlmConfig) -> None:
+def test_a_truncated_answer_is_an_error_that_names_the_limit(server: LlmServer, config: LlmConfig) -> None:
     server.say(code("x = 1\ny = ", finish="length"))
     model = Model(config)
     with pytest.raises(ReplyError, match="openai/local: the answer is cut off at 512 tokens; raise max_tokens"):
@@ -205,7 +203,7 @@ def test_an_answer_that_is_cut_off_is_an_error_that_says_what_to_raise(server: L
 
 
 @pytest.mark.parametrize("text", [None, "", "  \n ", "# Query: again"])
-def test_an_answer_without_a_word_is_an_error(server: LlmServer, config: LlmConfig, text: str | None) -> None:
+def test_an_empty_answer_is_an_error(server: LlmServer, config: LlmConfig, text: str | None) -> None:
     server.say(code(text))
     with pytest.raises(ReplyError, match="the answer is empty"):
         Model(config).complete(QUESTION, stop=("# Query: ",))
@@ -217,7 +215,7 @@ def test_a_response_without_choices_is_an_error(server: LlmServer, config: LlmCo
         Model(config).complete(QUESTION)
 
 
-def test_a_missing_key_is_told_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_key_is_reported_without_retries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("OPENAI_API_KEY", "OPENAI_ADMIN_KEY"):
         monkeypatch.delenv(name, raising=False)
     model = Model(LlmConfig(model="gpt-4o"))
@@ -231,7 +229,7 @@ def test_a_key_is_not_shown(config: LlmConfig) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"model": ""}, {"attempts": 0}, {"timeout_s": 0}, {"backoff_s": -1}])
-def test_a_config_that_cannot_work_is_refused(wrong: dict[str, Any]) -> None:
+def test_invalid_configs_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"model|attempts"):
         LlmConfig(**wrong)
 
@@ -239,7 +237,7 @@ def test_a_config_that_cannot_work_is_refused(wrong: dict[str, Any]) -> None:
 # What is kept
 
 
-def test_the_same_question_is_asked_once(server: LlmServer, config: LlmConfig) -> None:
+def test_repeated_requests_are_cached(server: LlmServer, config: LlmConfig) -> None:
     server.say("x = 1", "x = 2")
     model = Model(config)
     first, second = model.complete(QUESTION), model.complete(QUESTION)
@@ -248,7 +246,7 @@ def test_the_same_question_is_asked_once(server: LlmServer, config: LlmConfig) -
     assert model.usage == Usage(calls=1, cached=1, prompt_tokens=11, completion_tokens=7, unpriced=1)
 
 
-def test_another_model_object_finds_what_was_kept(server: LlmServer, config: LlmConfig) -> None:
+def test_another_model_object_reads_the_same_cache(server: LlmServer, config: LlmConfig) -> None:
     Model(config).complete(QUESTION)
     reply = Model(config).complete(QUESTION)
     assert (reply.cached, reply.prompt_tokens, len(server.requests)) == (True, 11, 1)
@@ -265,7 +263,7 @@ def test_another_model_object_finds_what_was_kept(server: LlmServer, config: Llm
     ],
     ids=str,
 )
-def test_any_difference_in_a_request_is_another_question(
+def test_any_difference_in_a_request_misses_the_cache(
     server: LlmServer, config: LlmConfig, other: dict[str, Any]
 ) -> None:
     model = Model(config)
@@ -274,20 +272,18 @@ def test_any_difference_in_a_request_is_another_question(
 
 
 @pytest.mark.parametrize("other", [{"model": "openai/other"}, {"options": {"seed": 1}}], ids=str)
-def test_another_model_or_option_is_another_question(
-    server: LlmServer, config: LlmConfig, other: dict[str, Any]
-) -> None:
+def test_another_model_or_option_misses_the_cache(server: LlmServer, config: LlmConfig, other: dict[str, Any]) -> None:
     Model(config).complete(QUESTION)
     assert not Model(replace(config, **other)).complete(QUESTION).cached
 
 
-def test_patience_and_key_are_no_part_of_the_question(server: LlmServer, config: LlmConfig) -> None:
+def test_retries_and_key_are_not_part_of_the_cache_key(server: LlmServer, config: LlmConfig) -> None:
     Model(config).complete(QUESTION)
     assert Model(replace(config, api_key="another", timeout_s=1, attempts=1)).complete(QUESTION).cached
 
 
 @pytest.mark.parametrize("answer", [code("x = 1", finish="length"), code("")], ids=["cut off", "empty"])
-def test_an_answer_that_cannot_be_used_is_not_kept(server: LlmServer, config: LlmConfig, answer: Answer) -> None:
+def test_unusable_answers_are_not_cached(server: LlmServer, config: LlmConfig, answer: Answer) -> None:
     server.say(answer, "x = 1")
     model = Model(config)
     with pytest.raises(ReplyError):
@@ -295,7 +291,7 @@ def test_an_answer_that_cannot_be_used_is_not_kept(server: LlmServer, config: Ll
     assert model.complete(QUESTION).text == "x = 1"
 
 
-def test_an_answer_that_fails_a_check_is_not_kept(server: LlmServer, config: LlmConfig) -> None:
+def test_answers_that_fail_a_check_are_not_cached(server: LlmServer, config: LlmConfig) -> None:
     def check(text: str) -> None:
         compile(text, "", "exec")
 
@@ -316,13 +312,13 @@ def test_the_cache_can_be_turned_off(
     assert not folder.exists()
 
 
-def test_the_cache_can_be_somewhere_else(server: LlmServer, config: LlmConfig, folder: Path, tmp_path: Path) -> None:
+def test_the_cache_folder_can_be_chosen(server: LlmServer, config: LlmConfig, folder: Path, tmp_path: Path) -> None:
     Model(replace(config, cache=tmp_path / "mine")).complete(QUESTION)
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["replies.sqlite3"]
     assert not folder.exists()
 
 
-def test_what_is_kept_is_json_and_says_what_was_asked_but_not_the_key(
+def test_cache_files_are_json_with_the_request_but_not_the_key(
     server: LlmServer, config: LlmConfig, folder: Path
 ) -> None:
     Model(config).complete(QUESTION, stop=("b",))
@@ -334,7 +330,7 @@ def test_what_is_kept_is_json_and_says_what_was_asked_but_not_the_key(
 
 
 @pytest.mark.parametrize("reply", ["{", "[]", '{"text": 1}', '"text"', b"\x80\x04]\x94."])
-def test_a_reply_that_someone_damaged_is_asked_for_again(
+def test_a_damaged_cache_entry_is_requested_again(
     server: LlmServer, config: LlmConfig, folder: Path, reply: str | bytes
 ) -> None:
     Model(config).complete(QUESTION)
@@ -343,14 +339,14 @@ def test_a_reply_that_someone_damaged_is_asked_for_again(
     assert not Model(config).complete(QUESTION).cached
 
 
-def test_a_file_that_is_no_cache_is_a_warning(server: LlmServer, config: LlmConfig, folder: Path) -> None:
+def test_a_file_in_place_of_the_cache_is_a_warning(server: LlmServer, config: LlmConfig, folder: Path) -> None:
     folder.mkdir()
     (folder / "replies.sqlite3").write_text("not a database, " * 100)
     with pytest.warns(UserWarning, match=r"replies\.sqlite3: replies of language models are not kept"):
         assert Model(config).complete(QUESTION).text == "pass"
 
 
-def test_a_folder_that_cannot_be_made_is_a_warning(server: LlmServer, config: LlmConfig, folder: Path) -> None:
+def test_a_cache_folder_that_cannot_be_created_is_a_warning(server: LlmServer, config: LlmConfig, folder: Path) -> None:
     folder.write_text("a file")
     with pytest.warns(UserWarning, match="are not kept"):
         assert Model(config).complete(QUESTION).text == "pass"
@@ -375,7 +371,7 @@ print(*(cache.get(f"shared {i}").text for i in range(25)), sep=",")
 """
 
 
-def test_processes_that_write_at_once_lose_nothing_and_agree(tmp_path: Path) -> None:
+def test_concurrent_processes_share_the_cache_without_loss(tmp_path: Path) -> None:
     command = [sys.executable, "-W", "error", "-c", WRITER, str(tmp_path)]
     pipe = subprocess.PIPE
     writers = [subprocess.Popen([*command, name], text=True, stdin=pipe, stdout=pipe, stderr=pipe) for name in "ab"]
@@ -427,13 +423,13 @@ assert dict(os.environ) == before, set(os.environ) ^ set(before)
 """
 
 
-def test_litellm_is_imported_late_without_network_env_files_or_a_word(tmp_path: Path) -> None:
+def test_litellm_is_imported_late_without_network_env_files_or_output(tmp_path: Path) -> None:
     (tmp_path / ".env").write_text("FROM_A_FILE=1\n")
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_a_missing_library_is_named_with_the_extra(config: LlmConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_reported_with_the_extra(config: LlmConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tenacity", None)
     with pytest.raises(ImportError, match=r"tenacity: pip install 'vecenv\[voxposer\]'"):
         Model(config).complete(QUESTION)
@@ -457,7 +453,7 @@ def test_the_default_model_needs_no_key_and_leaves_nothing_on_disk(folder: Path)
     assert not folder.exists()
 
 
-def test_what_the_offline_writer_does_not_understand_is_told_at_once(folder: Path) -> None:
+def test_the_offline_writers_errors_are_not_retried(folder: Path) -> None:
     pauses: list[float] = []
     model = Llm(sleep=pauses.append)
     with pytest.raises(ReplyError, match=r"^offline/libero: [^:]*: .*colourless green ideas"):

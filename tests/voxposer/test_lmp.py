@@ -146,7 +146,7 @@ def test_a_request_shows_examples_first_and_ends_with_the_query(setup: Callable[
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_planner_and_references_see_the_objects_the_others_do_not(setup: Callable[..., Setup], name: str) -> None:
+def test_only_planner_and_parse_query_obj_see_the_objects(setup: Callable[..., Setup], name: str) -> None:
     robot = setup({(name, "something"): "ret_val = 1"})
     with pytest.raises(LmpError) if name == "parse_query_obj" else no_error():
         getattr(robot.lmps, name)("something")
@@ -194,7 +194,7 @@ def test_a_query_without_words_or_with_too_many_is_refused(setup: Callable[..., 
     assert robot.server.requests == []
 
 
-def test_a_query_that_is_no_text_is_refused_where_it_was_asked(setup: Callable[..., Setup]) -> None:
+def test_a_query_that_is_not_text_is_refused_at_the_call(setup: Callable[..., Setup]) -> None:
     robot = setup({("composer", "go"): "get_affordance_map(5)"})
     with pytest.raises(LmpError, match="a query is text, not int") as caught:
         robot.lmps.composer("go")
@@ -202,7 +202,7 @@ def test_a_query_that_is_no_text_is_refused_where_it_was_asked(setup: Callable[.
     assert caught.value.__notes__ == ["in composer('go')"]
 
 
-def test_without_objects_nothing_that_needs_them_is_asked(setup: Callable[..., Setup]) -> None:
+def test_lmps_that_need_objects_are_not_asked_without_them(setup: Callable[..., Setup]) -> None:
     robot = setup({})
     lmps = Lmps(robot.world.functions(), robot.llm, PROMPTS)
     with pytest.raises(LmpError, match="call set_context first"):
@@ -224,14 +224,14 @@ for place in ['left', 'right']:
 # done"""
 
 
-def test_planning_records_the_subtasks_and_does_nothing(setup: Callable[..., Setup]) -> None:
+def test_planning_records_the_subtasks_without_executing(setup: Callable[..., Setup]) -> None:
     robot = setup({("planner", "tidy up"): PLAN})
     assert robot.lmps.plan("tidy up") == ("grasp the bowl", "move to the left", "move to the right")
     assert robot.world.done == []
     assert [call.lmp for call in robot.lmps.trace] == ["planner"]
 
 
-def test_the_planner_itself_does_its_subtasks_in_order(setup: Callable[..., Setup]) -> None:
+def test_the_planner_executes_its_subtasks_in_order(setup: Callable[..., Setup]) -> None:
     answers = {("planner", "tidy up"): "composer('wait')\ncomposer('go home')", ("composer", "wait"): "pass"}
     robot = setup({**answers, ("composer", "go home"): "reset_to_default_pose()"})
     robot.lmps.planner("tidy up")
@@ -281,7 +281,7 @@ def test_a_subtask_executes_once_or_several_times_with_maps_and_without(setup: C
     assert maps["affordance_map"].dtype == np.float64
 
 
-def test_the_trace_tells_what_was_asked_written_and_paid(setup: Callable[..., Setup]) -> None:
+def test_the_trace_has_queries_programs_and_costs(setup: Callable[..., Setup]) -> None:
     robot = setup(GRASP)
     robot.lmps.composer("go")
     call = call_of(robot.lmps, "get_affordance_map")
@@ -294,7 +294,7 @@ def test_the_trace_tells_what_was_asked_written_and_paid(setup: Callable[..., Se
     assert robot.lmps.trace == []
 
 
-def test_the_trace_tells_which_answers_were_kept(setup: Callable[..., Setup], tmp_path: Path) -> None:
+def test_the_trace_marks_cached_answers(setup: Callable[..., Setup], tmp_path: Path) -> None:
     robot = setup({("composer", "wait"): "pass"})
     llm = Llm(replace(robot.llm.config, cache=tmp_path))
     lmps = Lmps({}, llm, PROMPTS)
@@ -306,7 +306,7 @@ def test_the_trace_tells_which_answers_were_kept(setup: Callable[..., Setup], tm
 # Maps and observations are programs still
 
 
-def test_a_map_is_made_when_it_is_asked_for_from_what_is_there_then(setup: Callable[..., Setup]) -> None:
+def test_a_map_is_computed_from_the_state_when_it_is_called(setup: Callable[..., Setup]) -> None:
     robot = setup({**FINDS, ("get_affordance_map", "above the bowl"): ABOVE})
     above = robot.lmps.get_affordance_map("above the bowl")
     assert isinstance(above, LazyMap)
@@ -317,7 +317,7 @@ def test_a_map_is_made_when_it_is_asked_for_from_what_is_there_then(setup: Calla
     assert np.argwhere(above()).tolist() == [[1, 2, 9]]
 
 
-def test_an_observation_is_looked_at_anew_whenever_it_is_read(setup: Callable[..., Setup]) -> None:
+def test_an_observation_is_refreshed_at_each_read(setup: Callable[..., Setup]) -> None:
     robot = setup(FINDS)
     bowl = robot.lmps.parse_query_obj("bowl")
     assert isinstance(bowl, DynamicObservation)
@@ -329,7 +329,7 @@ def test_an_observation_is_looked_at_anew_whenever_it_is_read(setup: Callable[..
     assert len(robot.server.requests) == 1
 
 
-def test_several_things_are_found_as_a_list_of_observations(setup: Callable[..., Setup]) -> None:
+def test_several_objects_are_a_list_of_observations(setup: Callable[..., Setup]) -> None:
     robot = setup(FINDS)
     cups = robot.lmps.parse_query_obj("cups")
     assert isinstance(cups, DynamicObservations)
@@ -352,7 +352,7 @@ def test_programs_read_an_observations_fields_but_not_those_of_the_host(setup: C
         _ = found.colour
 
 
-def test_what_programs_get_of_an_observation_is_a_copy() -> None:
+def test_programs_get_copies_of_observation_fields() -> None:
     seen = Observation({"position": np.zeros(3), "parts": ["lid"]})
     seen["position"][0] = 9
     seen["parts"].append("knob")
@@ -360,7 +360,7 @@ def test_what_programs_get_of_an_observation_is_a_copy() -> None:
 
 
 @pytest.mark.parametrize("program", ["ret_val = None", "ret_val = []", "ret_val = 5", "x = 1", "ret_val = [None]"])
-def test_a_reference_to_nothing_is_an_error_that_says_so(setup: Callable[..., Setup], program: str) -> None:
+def test_a_reference_to_nothing_is_an_error(setup: Callable[..., Setup], program: str) -> None:
     robot = setup({("parse_query_obj", "unicorn"): program})
     with pytest.raises(LmpError, match=r"parse_query_obj\('unicorn'\): the program found") as caught:
         robot.lmps.parse_query_obj("unicorn")
@@ -379,7 +379,7 @@ def test_a_reference_to_nothing_is_an_error_that_says_so(setup: Callable[..., Se
         ("get_velocity_map", "ret_val = get_empty_velocity_map() * np.nan", "not finite"),
     ],
 )
-def test_a_map_that_is_none_is_an_error_when_it_is_made(
+def test_an_invalid_map_is_an_error_when_it_is_computed(
     setup: Callable[..., Setup], name: str, program: str, told: str
 ) -> None:
     robot = setup({(name, "here"): program})
@@ -480,7 +480,7 @@ def evaluated(made: LazyMap) -> np.ndarray:
         *[(name, "get_affordance_map('x')") for name in MAPS],
     ],
 )
-def test_a_program_calls_only_what_its_lmp_is_for(setup: Callable[..., Setup], name: str, program: str) -> None:
+def test_a_program_calls_only_the_functions_of_its_lmp(setup: Callable[..., Setup], name: str, program: str) -> None:
     robot = setup({(name, "go"): program})
     with pytest.raises(LmpError) as caught:
         evaluated(getattr(robot.lmps, name)("go"))
@@ -501,7 +501,7 @@ def test_an_error_names_lmp_query_line_and_rule_and_is_in_the_trace(setup: Calla
     assert call_of(robot.lmps, "composer").error == str(error)
 
 
-def test_an_error_deep_down_is_told_as_the_innermost_programs_with_the_way_to_it(setup: Callable[..., Setup]) -> None:
+def test_a_nested_error_is_the_innermost_programs_with_the_call_chain(setup: Callable[..., Setup]) -> None:
     answers = {
         ("composer", "go"): "m = get_affordance_map('there')\nexecute(parse_query_obj('gripper'), m)",
         ("get_affordance_map", "there"): "\nret_val = parse_query_obj('unicorn')",
@@ -519,16 +519,18 @@ def test_an_error_deep_down_is_told_as_the_innermost_programs_with_the_way_to_it
 
 
 @pytest.mark.parametrize("text", ["Sure! I would love to help.", "The bowl is on the table:\n- grasp it", "x = (1"])
-def test_an_answer_that_is_no_program_is_told_with_lmp_and_model(setup: Callable[..., Setup], text: str) -> None:
+def test_an_answer_that_is_not_a_program_is_reported_with_lmp_and_model(setup: Callable[..., Setup], text: str) -> None:
     robot = setup({("get_gripper_map", "go"): text})
-    with pytest.raises(LmpError, match=r"get_gripper_map\('go'\): .*openai/local wrote what cannot be run") as caught:
+    with pytest.raises(
+        LmpError, match=r"get_gripper_map\('go'\): .*openai/local wrote a program that cannot be run"
+    ) as caught:
         robot.lmps.get_gripper_map("go")
     assert caught.value.rule == "syntax"
     assert repr(text.splitlines()[0]) in caught.value.reason
     assert call_of(robot.lmps, "get_gripper_map").code == text
 
 
-def test_an_answer_that_is_no_program_is_not_kept(setup: Callable[..., Setup], tmp_path: Path) -> None:
+def test_an_answer_that_is_not_a_program_is_not_cached(setup: Callable[..., Setup], tmp_path: Path) -> None:
     robot = setup({("composer", "go"): "Sure thing!"})
     lmps = Lmps({}, Llm(replace(robot.llm.config, cache=tmp_path)), PROMPTS)
     with pytest.raises(LmpError):
@@ -541,7 +543,7 @@ def test_an_answer_that_is_no_program_is_not_kept(setup: Callable[..., Setup], t
 @pytest.mark.parametrize(
     ("answer", "told"), [(code("x = 1", finish="length"), "cut off at 512 tokens"), (code(""), "empty")]
 )
-def test_an_answer_that_is_cut_off_or_empty_is_the_lmps_error(
+def test_a_truncated_or_empty_answer_is_an_error_of_the_lmp(
     setup: Callable[..., Setup], answer: Answer, told: str
 ) -> None:
     robot = setup({("composer", "go"): answer})
@@ -550,15 +552,15 @@ def test_an_answer_that_is_cut_off_or_empty_is_the_lmps_error(
     assert (caught.value.rule, caught.value.line) == ("reply", None)
 
 
-def test_a_provider_that_refuses_is_nobodys_program(setup: Callable[..., Setup]) -> None:
+def test_a_provider_error_is_not_an_error_of_a_program(setup: Callable[..., Setup]) -> None:
     robot = setup({("composer", "go"): "get_gripper_map('open')", ("get_gripper_map", "open"): failure(401, "bad key")})
     with pytest.raises(LlmError, match="bad key") as caught:
         robot.lmps.composer("go")
-    assert caught.value.__notes__ == ["asked by get_gripper_map('open')", "in composer('go')"]
+    assert caught.value.__notes__ == ["requested by get_gripper_map('open')", "in composer('go')"]
     assert "bad key" in (call_of(robot.lmps, "get_gripper_map").error or "")
 
 
-def test_a_program_that_asks_for_programs_without_end_is_stopped(setup: Callable[..., Setup]) -> None:
+def test_endless_requests_for_programs_are_stopped(setup: Callable[..., Setup]) -> None:
     answers = {("composer", "go"): "while True:\n    get_gripper_map('open')", ("get_gripper_map", "open"): "pass"}
     robot = setup(answers, limits=Limits(programs=10))
     with pytest.raises(LmpError, match="more than 10 further programs") as caught:
@@ -569,13 +571,13 @@ def test_a_program_that_asks_for_programs_without_end_is_stopped(setup: Callable
     robot.lmps.composer("wait")
 
 
-def test_a_map_may_be_made_any_number_of_times(setup: Callable[..., Setup]) -> None:
+def test_a_map_may_be_computed_any_number_of_times(setup: Callable[..., Setup]) -> None:
     robot = setup({**FINDS, ("get_affordance_map", "above the bowl"): ABOVE}, limits=Limits(programs=1))
     above = robot.lmps.get_affordance_map("above the bowl")
     assert [int(above().sum()) for _ in range(4)] == [1, 1, 1, 1]
 
 
-def test_the_steps_of_programs_within_a_program_are_its_own(setup: Callable[..., Setup]) -> None:
+def test_nested_programs_use_the_outer_programs_steps(setup: Callable[..., Setup]) -> None:
     answers = {("composer", "go"): "g = parse_query_obj('gripper')\nfor i in range(100):\n    p = g.position"}
     busy = "x = 0\nfor i in range(20):\n    x += i\nret_val = detect('gripper')"
     robot = setup({**answers, ("parse_query_obj", "gripper"): busy}, limits=Limits(steps=2000))
@@ -584,7 +586,7 @@ def test_the_steps_of_programs_within_a_program_are_its_own(setup: Callable[...,
         robot.lmps.composer("go")
 
 
-def test_a_host_function_that_fails_is_told_with_the_line_that_called_it(setup: Callable[..., Setup]) -> None:
+def test_a_failing_host_function_is_reported_with_the_calling_line(setup: Callable[..., Setup]) -> None:
     robot = setup({("composer", "go"): "pass\nexecute()"})
     with pytest.raises(LmpError, match=r"execute: TypeError: .*movable") as caught:
         robot.lmps.composer("go")
@@ -616,9 +618,7 @@ def write_prompts(folder: Path, ending: str) -> None:
 
 
 @pytest.mark.parametrize("ending", [".txt", "_prompt.txt"])
-def test_prompts_come_from_a_folder_named_as_ours_or_as_upstreams(
-    setup: Callable[..., Setup], tmp_path: Path, ending: str
-) -> None:
+def test_prompt_files_may_have_our_names_or_upstreams(setup: Callable[..., Setup], tmp_path: Path, ending: str) -> None:
     write_prompts(tmp_path, ending)
     robot = setup({("get_gripper_map", "open"): "pass"})
     lmps = build_lmps(robot.world.functions(), robot.llm, tmp_path)
@@ -655,5 +655,5 @@ def test_a_prompt_that_is_missing_is_named(tmp_path: Path) -> None:
         ("", ""),
     ],
 )
-def test_the_code_of_an_answer_is_what_stands_in_its_fences(text: str, program: str) -> None:
+def test_the_code_of_an_answer_is_inside_its_fences(text: str, program: str) -> None:
     assert code_in(text) == program

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.offline_world import ToyWorld
 
-from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud
+from vecenv.observations import ObjectsSnapshot, Part, PartJoint, PointCloud
 from voxposer.language.observations import DynamicObservations
 from voxposer.language.prompts import load_prompts
 from voxposer.offline import provider as offline
@@ -71,7 +71,7 @@ def said(instruction: str) -> list[str]:
         ("move coke can near apple", [("grasp", "coke_can"), ("put", "coke_can")]),
     ],
 )
-def test_simpler_instructions_move_the_thing_that_is_said(instruction: str, result: list[tuple[str, str]]) -> None:
+def test_simpler_instructions_move_the_named_object(instruction: str, result: list[tuple[str, str]]) -> None:
     names = (
         "spoon",
         "table_cloth",
@@ -160,7 +160,7 @@ def test_simpler_drawers_open_and_close() -> None:
         ("close the bottom drawer and open the top one", ["close the bottom drawer", "open the top one"]),
     ],
 )
-def test_instructions_are_read(instruction: str, actions: list[str]) -> None:
+def test_instructions_are_parsed(instruction: str, actions: list[str]) -> None:
     assert said(instruction) == actions
 
 
@@ -177,7 +177,7 @@ def test_instructions_are_read(instruction: str, actions: list[str]) -> None:
         "the bowl on the plate on the left",
     ],
 )
-def test_a_noun_said_again_is_read_as_the_same_noun(phrase: str) -> None:
+def test_a_noun_written_out_is_parsed_to_the_same_noun(phrase: str) -> None:
     noun = read_noun(phrase)
     assert str(noun) == phrase
     assert read_noun(str(noun)) == noun
@@ -244,13 +244,13 @@ BOWLS = {"bowl_1": (-0.5, -0.2, 0.0), "bowl_2": (-0.2, 0.0, 0.0), "bowl_3": (0.1
         ("held object", "gripper"),
     ],
 )
-def test_positions_settle_what_words_leave_open(phrase: str, found: str) -> None:
+def test_positions_resolve_ambiguous_words(phrase: str, found: str) -> None:
     world = ToyWorld(scene(BOWLS | {"plate_1": (0.1, 0.2, 0.0), "mug_1": (-0.45, -0.1, 0.0)}), size=100)
     thing = world.detected(phrase)
     assert thing["name"] == found
 
 
-def test_on_is_told_from_beside_and_below_by_heights() -> None:
+def test_on_is_distinguished_from_beside_and_below_by_heights() -> None:
     stacked = ToyWorld(
         scene(
             {
@@ -264,13 +264,13 @@ def test_on_is_told_from_beside_and_below_by_heights() -> None:
     assert stacked.detected("the bowl on the box")["name"] == "bowl_1"
 
 
-def test_several_things_come_as_a_list() -> None:
+def test_several_objects_come_as_a_list() -> None:
     found = ToyWorld(scene(BOWLS)).lmps.parse_query_obj("all bowls")
     assert isinstance(found, DynamicObservations)
     assert [thing["name"] for thing in found] == list(BOWLS)
 
 
-def test_alike_things_are_told_apart_after_one_was_moved() -> None:
+def test_equal_objects_are_distinguished_after_one_was_moved() -> None:
     """The right bowl goes to the left of everything; then "the left bowl" is still the one that was left before."""
     world = ToyWorld(
         scene({"bowl_1": (-0.2, 0.0, 0.0), "bowl_2": (-0.2, 0.3, 0.0), "tray_1": (-0.2, -0.3, 0.0)}), size=100
@@ -283,7 +283,7 @@ def test_alike_things_are_told_apart_after_one_was_moved() -> None:
 # Subtasks
 
 
-def test_two_things_on_one_flat_place_get_a_half_each() -> None:
+def test_two_objects_on_one_flat_place_get_a_half_each() -> None:
     names = ["moka_pot_1", "moka_pot_2", "stove_1", "stove_1_burner", "basket_1"]
     program = write_planner("put both moka pots on the stove", names)
     assert re.findall("place it .*?1", program) == [
@@ -298,7 +298,7 @@ def test_two_things_on_one_flat_place_get_a_half_each() -> None:
     assert world.bounds("pot_2").mean(axis=0)[1] == pytest.approx(0.115, abs=0.006)
 
 
-def test_what_is_to_be_avoided_and_the_speed_go_along_with_every_motion() -> None:
+def test_avoidance_and_speed_apply_to_every_motion() -> None:
     program = write_planner(
         "put the mug on the plate slowly while avoiding the bottle", ["mug_1", "plate_1", "wine_bottle_1"]
     )
@@ -310,7 +310,7 @@ def test_what_is_to_be_avoided_and_the_speed_go_along_with_every_motion() -> Non
     assert "avoidance_map=avoidance_map, velocity_map=velocity_map)" in code
 
 
-def test_maps_hold_what_their_query_says() -> None:
+def test_maps_match_their_query() -> None:
     world = ToyWorld(scene({"mug_1": (-0.2, 0.1, 0.0), "wine_bottle_1": (-0.5, 0.1, 0.0)}), size=100)
     assert world.lmps.get_velocity_map("0.5x speed")().max() == 0.5
     near = world.lmps.get_velocity_map("0.5x speed when within 10cm of the mug")()
@@ -349,19 +349,19 @@ def test_directions_are_x_to_the_front_y_to_the_right_z_up(query: str, point: tu
 @pytest.mark.parametrize(
     ("instruction", "complaint"),
     [
-        ("sing a song", "no verb"),
+        ("sing a song", "no known verb"),
         ("put the teapot on the plate", "'the teapot' fits none of mug_1, mug_2, plate_1"),
         ("put the mug on the plate", "'the mug' could be any of mug_1, mug_2"),
-        ("put the left mug", "where to put"),
-        ("put it on the plate", "what is to be put"),
-        ("put the left mug between the plate", "'between' needs two things"),
+        ("put the left mug", "the destination of"),
+        ("put it on the plate", "the object to put there is missing"),
+        ("put the left mug between the plate", "'between' needs two objects"),
         ("open the plate", "no handle to the plate"),
         ("turn on the plate", "no knob to the plate"),
         ("put the left mug next to the teapot", "the teapot"),
-        ("", "no verb"),
+        ("", "no known verb"),
     ],
 )
-def test_the_planner_says_what_it_does_not_understand(instruction: str, complaint: str) -> None:
+def test_the_planner_reports_what_it_does_not_understand(instruction: str, complaint: str) -> None:
     with pytest.raises(NotUnderstood, match=complaint):
         write_planner(instruction, ["mug_1", "mug_2", "plate_1"])
 
@@ -410,12 +410,12 @@ def asked(lmp: str, query: str, objects: list[str] | None = None) -> list[dict[s
         ("get_gripper_map", "open everywhere", "gripper_map[:, :, :] = 1"),
     ],
 )
-def test_which_program_is_wanted_is_read_off_the_examples(lmp: str, query: str, program: str) -> None:
+def test_the_requested_lmp_is_recognised_by_its_examples(lmp: str, query: str, program: str) -> None:
     objects = ["stove_1", "stove_1_knob"] if lmp in {"planner", "parse_query_obj"} else None
     assert program in offline.write(asked(lmp, query, objects))
 
 
-def test_a_name_in_the_request_goes_before_the_examples() -> None:
+def test_a_name_in_the_request_takes_precedence_over_examples() -> None:
     messages = [
         {"role": "user", "content": "Queries are for `get_gripper_map`. detect("},
         *asked("planner", "open everywhere")[1:],
@@ -443,7 +443,7 @@ def test_content_may_come_in_parts() -> None:
         ),
     ],
 )
-def test_requests_that_make_no_sense_are_refused(messages: list[dict[str, str]], complaint: str) -> None:
+def test_invalid_requests_are_refused(messages: list[dict[str, str]], complaint: str) -> None:
     with pytest.raises(NotUnderstood, match=complaint):
         offline.write(messages)
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from support.voxposer_world import HOME, box, handle, snapshot, space
 
 import vecenv
-from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from vecenv.libero.env import LiberoEnv
 from vecenv.manipulation.grasps import Gripper, room_around
 from vecenv.manipulation.world import matrix
+from vecenv.observations import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from voxposer.perception.config import HandState
 from voxposer.perception.grid import VoxelGrid
 from voxposer.perception.observation import PerceptionError
@@ -105,7 +105,7 @@ def test_parts_are_the_same_with_lean_geometry(kitchen: LiberoEnv) -> None:
         np.testing.assert_array_equal(part.cloud.normals, wanted[name].cloud.normals)
 
 
-def test_what_is_not_there_is_named_with_what_is_like_it(kitchen: LiberoEnv) -> None:
+def test_an_unknown_name_is_reported_with_similar_names(kitchen: LiberoEnv) -> None:
     with pytest.raises(PerceptionError, match="akita_black_bowl_1"):
         see(look(kitchen)).detect("akita_black_bowl_2")
 
@@ -128,7 +128,7 @@ def test_the_table_is_flat_and_faces_up() -> None:
 # -- frozen ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_snapshot_that_is_being_planned_on_refuses_to_be_written() -> None:
+def test_snapshots_are_read_only_while_planned_on() -> None:
     seen = snapshot({"cube_1": box((0.02, 0.02, 0.02), (0.1, 0, 0.02))}, parts={"cabinet_1_handle": handle()})
     see(seen)
     for array in (seen.objects["cube_1"].points, seen.ee_pose, seen.parts["cabinet_1_handle"].cloud.normals):
@@ -136,7 +136,7 @@ def test_a_snapshot_that_is_being_planned_on_refuses_to_be_written() -> None:
             array[0] = 1.0
 
 
-def test_what_a_program_does_to_an_observation_stays_with_the_program() -> None:
+def test_changes_to_an_observation_stay_with_the_program() -> None:
     world = see(snapshot({"cube_1": box((0.02, 0.02, 0.02), (0.1, 0, 0.02))}))
     position = world.detect("cube_1").position
     position += 7
@@ -146,7 +146,7 @@ def test_what_a_program_does_to_an_observation_stays_with_the_program() -> None:
 # -- grasping ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_grasp_is_a_voxel_that_remembers_where_exactly_it_is() -> None:
+def test_a_grasp_voxel_keeps_its_exact_position() -> None:
     world = see(snapshot({"cube_1": box((0.02, 0.03, 0.02), (0.1037, 0.0213, 0.02))}))
     voxel = world.detect("cube_1").grasp_position
     exact = world.position_of(voxel)
@@ -179,7 +179,7 @@ def test_a_handle_is_pinched_across_its_bar_from_outside() -> None:
     assert matrix(seen.push_quat)[:, 1] @ np.array([0.0, 0.0, 1.0]) == pytest.approx(0, abs=1e-6)
 
 
-def test_a_handle_knows_whether_it_is_open() -> None:
+def test_a_handle_reports_whether_it_is_open() -> None:
     cabinet = {"cabinet_1": box((0.1, 0.1, 0.11), (0.2, -0.02, 0.11))}
     shut, wide = (see(snapshot(cabinet, ("cabinet_1",), parts={"h": handle(x)})).detect("h") for x in (0.0, 0.15))
     assert not shut.is_open
@@ -194,13 +194,13 @@ def test_a_fixture_is_held_by_its_parts_only() -> None:
         _ = world.detect("cabinet_1").grasp_position
 
 
-def test_what_is_too_wide_offers_no_grasp() -> None:
+def test_objects_that_are_too_wide_have_no_grasp() -> None:
     world = see(snapshot({"crate_1": box((0.06, 0.06, 0.05), (0.1, 0, 0.05))}))
     with pytest.raises(PerceptionError, match="crate_1 offers nothing to hold"):
         _ = world.detect("crate_1").grasp_quat
 
 
-def test_a_grasp_that_failed_is_not_the_first_choice_again() -> None:
+def test_a_failed_grasp_is_not_chosen_again_first() -> None:
     seen = snapshot({"can_1": box((0.02, 0.035, 0.04), (0.1, 0, 0.04))})
     first = see(seen)
     at = first.position_of(first.detect("can_1").grasp_position)
@@ -223,7 +223,7 @@ def holding(centre: tuple[float, float, float] = (0.0, 0.0, 0.385)) -> ObjectsSn
     return snapshot(things, parts={"basket_1_inside": inside}, gripper=np.array([0.0155, -0.0155]))
 
 
-def test_what_is_between_the_closed_fingers_is_held() -> None:
+def test_the_object_between_the_closed_fingers_is_held() -> None:
     assert see(holding(), closed=True).held == "cube_1"
     assert see(holding(), closed=False).held == ""
     assert see(replace(holding(), gripper=np.array([0.0005, -0.0005])), closed=True).held == ""
@@ -238,19 +238,19 @@ def test_the_held_object_comes_to_rest_on_what_it_is_placed_on() -> None:
     assert 0.009 < moved[:, 2].min() < 0.03
 
 
-def test_placing_in_a_thing_with_one_space_goes_into_that() -> None:
+def test_placing_in_an_object_with_one_space_uses_that_space() -> None:
     world = see(holding(), closed=True)
     whole, inside = (world.detect(name).place_position for name in ("basket_1", "basket_1_inside"))
     np.testing.assert_array_equal(whole, inside)
     assert (np.abs(world.position_of(inside)[:2] - [0.2, -0.25]) < 0.06).all()
 
 
-def test_without_anything_in_hand_a_place_is_above_the_thing() -> None:
+def test_with_an_empty_hand_a_place_is_above_the_object() -> None:
     world = see(snapshot({"plate_1": box((0.07, 0.07, 0.005), (0.25, 0.1, 0.005))}))
     np.testing.assert_allclose(world.position_of(world.detect("plate_1").place_position), [0.25, 0.1, 0.11], atol=0.003)
 
 
-def test_what_is_held_moves_along_with_the_hand() -> None:
+def test_a_held_object_moves_with_the_hand() -> None:
     world = see(holding(), closed=True)
     before = world.detect("held object")
     offset = before.hand_offset
@@ -313,7 +313,7 @@ def test_room_is_measured_around_fingers_palm_and_wrist() -> None:
     assert room_around(HOME[:3], matrix(HOME[3:]), np.zeros((0, 3)), gripper) == np.inf
 
 
-def test_a_hand_leans_to_grasp_what_something_hangs_over() -> None:
+def test_a_hand_leans_to_grasp_under_an_overhang() -> None:
     plank = box((0.1, 0.1, 0.01), (0.1, 0.11, 0.17), 2000)
     world = see(snapshot({"cube_1": box((0.02, 0.02, 0.025), (0.1, 0, 0.025)), "plank_1": plank}, ("plank_1",)))
     seen = world.detect("cube_1")
@@ -344,7 +344,7 @@ def test_a_voxels_middle_is_in_it(voxel: tuple[int, int, int]) -> None:
 
 
 @given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1))
-def test_quaternions_and_matrices_say_the_same(raw: tuple[float, float, float, float]) -> None:
+def test_quaternions_and_matrices_agree(raw: tuple[float, float, float, float]) -> None:
     quat = np.array(raw) / np.linalg.norm(raw)
     again = quaternion(matrix(quat))
     assert abs(again @ quat) == pytest.approx(1, abs=1e-6)

@@ -121,7 +121,7 @@ def test_examples_are_what_the_offline_writer_writes(example: Example) -> None:
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
-def test_examples_call_and_read_only_what_there_is(example: Example) -> None:
+def test_examples_use_only_existing_functions_and_fields(example: Example) -> None:
     tree = ast.parse(example.program)
     called = {node.func.id for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
     assert called <= CALLABLE[example.lmp] | {"sum", "len"}
@@ -131,7 +131,7 @@ def test_examples_call_and_read_only_what_there_is(example: Example) -> None:
 
 
 @pytest.mark.parametrize("example", of("composer"))
-def test_maps_that_the_composer_asks_for_are_understood(example: Example) -> None:
+def test_map_queries_of_the_composer_are_understood(example: Example) -> None:
     asked = re.findall(r"(get_\w+_map)\((['\"])(.+?)\2\)", example.program)
     assert asked or "reset_to_default_pose" in example.program
     for lmp, _, query in asked:
@@ -147,7 +147,7 @@ def test_subtasks_that_the_planner_names_are_understood(example: Example) -> Non
 
 
 @pytest.mark.parametrize("example", of("parse_query_obj"))
-def test_only_things_that_are_there_are_detected(example: Example) -> None:
+def test_only_existing_objects_are_detected(example: Example) -> None:
     names = {node.value for node in ast.walk(ast.parse(example.program)) if isinstance(node, ast.Constant)}
     strings = {name for name in names if isinstance(name, str)} - {"x", "y", "z"}
     assert strings <= {*example.objects, "gripper", "table", "held object"}

@@ -16,7 +16,7 @@ from vecenv.util.rotations import quat_to_mat
 from voxposer.planning import push
 from voxposer.planning.push import PushConfig, best_push, push_waypoints
 
-pytestmark = pytest.mark.usefixtures("explicit_ranks")
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 
 # Few samples suffice where the best of them is not the question.
 FEW = PushConfig(num_samples=300)
@@ -47,7 +47,7 @@ def test_costs_are_those_of_moving_the_whole_cloud() -> None:
     np.testing.assert_allclose(costs, reference.push_costs(points, goal, samples, block=200), atol=1e-12)
 
 
-def test_a_hand_that_moves_away_from_the_thing_does_not_move_it() -> None:
+def test_a_hand_that_moves_away_does_not_move_the_object() -> None:
     centre, goal = jnp.zeros(3), jnp.array([1.0, 0, 0])
     contact = jnp.array([[-0.1, 0, 0], [0.1, 0, 0]])
     predicted, cost = push.push_costs(centre, goal, contact, jnp.array([[1.0, 0, 0]] * 2), jnp.array([0.05, 0.05]))
@@ -57,7 +57,7 @@ def test_a_hand_that_moves_away_from_the_thing_does_not_move_it() -> None:
 
 @steady
 @given(angle=st.floats(0, 6.28), far=st.floats(0.02, 0.085))
-def test_the_best_push_brings_the_thing_to_a_target_in_reach(angle: float, far: float) -> None:
+def test_the_best_push_reaches_a_target_in_range(angle: float, far: float) -> None:
     points = plate()
     centre = points.mean(0)
     goal = centre + far * np.array([np.cos(angle), np.sin(angle), 0], np.float32)
@@ -75,7 +75,7 @@ def test_a_target_out_of_reach_is_approached_as_far_as_one_push_goes() -> None:
     assert found.cost[0] == pytest.approx(0.41, abs=0.01)
 
 
-def test_the_hand_touches_where_it_first_meets_the_thing() -> None:
+def test_the_contact_is_where_the_hand_first_meets_the_object() -> None:
     points = plate(2000)
     found = best_push(points[None], target(0.06, 0)[None], KEY)
     contact, along = np.asarray(found.contact[0]), np.asarray(found.direction[0])
@@ -85,7 +85,7 @@ def test_the_hand_touches_where_it_first_meets_the_thing() -> None:
     assert (offset @ along)[aside <= 0.02].min() > -1e-4
 
 
-def test_upstreams_negative_distances_draw_a_thing_back() -> None:
+def test_negative_distances_pull_an_object_back() -> None:
     near = plate().mean(0) + np.array([0.015, 0, 0], np.float32)
     drawn = best_push(plate()[None], near[None], KEY, PushConfig(min_distance=-0.02, max_distance=-0.01))
     assert drawn.distance[0] < 0
@@ -112,13 +112,13 @@ def test_contacts_keep_between_the_heights_allowed() -> None:
     assert TABLE <= found.contact[1, 2] <= TABLE + 0.005
 
 
-def test_a_thing_lower_than_the_hand_may_go_is_pushed_at_the_lowest_height() -> None:
+def test_an_object_below_the_lowest_height_is_pushed_at_that_height() -> None:
     found = best_push(plate()[None], target()[None], KEY, lowest=TABLE + 0.04)
     assert found.contact[0, 2] == pytest.approx(TABLE + 0.04)
     assert found.cost[0] < 0.005
 
 
-def test_padding_and_broken_points_do_not_count() -> None:
+def test_padding_and_non_finite_points_do_not_count() -> None:
     points = plate(200)
     padded = np.concatenate([points, np.full((50, 3), 5.0), np.full((6, 3), np.nan)]).astype(np.float32)
     valid = np.arange(256) < 200
@@ -128,7 +128,7 @@ def test_padding_and_broken_points_do_not_count() -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), kept, plain)
 
 
-def test_a_thing_without_points_has_no_push() -> None:
+def test_an_object_without_points_has_no_push() -> None:
     found = best_push(plate()[None], target()[None], KEY, FEW, valid=np.zeros((1, 320), bool))
     assert jnp.isinf(found.cost[0])
     assert all(np.isfinite(np.asarray(x)).all() for x in (found.contact, found.direction, found.distance))
@@ -143,7 +143,8 @@ def test_with_a_key_a_slot_a_push_does_not_depend_on_the_batch() -> None:
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[0], b[i], atol=1e-6), alone, together)
 
 
-def test_input_that_does_not_fit_is_named() -> None:
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_invalid_input_is_reported() -> None:
     with pytest.raises(ValueError, match=r"must be \[B, M, 3\] and \[B, 3\]"):
         best_push(plate(), target()[None], KEY)
     with pytest.raises(ValueError, match="one key or 1"):

@@ -114,14 +114,14 @@ def test_hostile_programs_are_refused_in_little_memory_without_a_file_or_process
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_program_is_stopped_when_its_time_is_up() -> None:
+def test_a_program_is_stopped_at_its_time_limit() -> None:
     endless = "while True:\n    pass"
     error = refusal(endless, limits=Limits(steps=10**9, seconds=0.05))
     assert error.rule == "time"
     assert error.line in (1, 2)
 
 
-def test_the_time_that_the_host_takes_is_not_the_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_in_host_functions_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr("voxposer.sandbox.guard.time.monotonic", lambda: now[0])
 
@@ -144,14 +144,14 @@ def test_any_text_runs_or_is_refused(source: str) -> None:
 # The host's side
 
 
-def test_an_error_of_a_given_function_names_it_and_is_the_cause() -> None:
+def test_an_error_of_a_host_function_names_it_and_is_the_cause() -> None:
     error = refusal("x = 1\ny = detect('unicorn')")
     assert (error.line, error.rule) == (2, "call")
     assert "detect: KeyError" in error.reason
     assert isinstance(error.__cause__, KeyError)
 
 
-def test_a_fault_of_the_host_passes_unchanged() -> None:
+def test_a_host_fault_passes_unchanged() -> None:
     fault = HostFault("the robot is on fire")
 
     def burn() -> None:
@@ -162,8 +162,8 @@ def test_a_fault_of_the_host_passes_unchanged() -> None:
     assert caught.value is fault
 
 
-def test_a_function_that_returns_what_no_program_may_hold_is_named() -> None:
-    with pytest.raises(SandboxError, match="module is no kind of value") as caught:
+def test_a_host_function_with_a_forbidden_result_is_named() -> None:
+    with pytest.raises(SandboxError, match="module is not a kind of value") as caught:
         parse("x = leak()").run({"leak": lambda: np})
     assert caught.value.rule == "values"
 
@@ -180,7 +180,7 @@ def test_programs_share_a_budget_with_those_that_call_them() -> None:
     assert isinstance(caught.value.__cause__, SandboxError)
 
 
-def test_what_a_program_reads_of_an_observation_is_its_own() -> None:
+def test_fields_read_from_an_observation_are_copies() -> None:
     found = variables("p = detect('bowl').position\np[0] = 99\nq = detect('bowl').position")
     assert found["p"].tolist() == [99, 30, 40]
     assert found["q"].tolist() == [20, 30, 40]
@@ -195,7 +195,7 @@ def test_an_error_quotes_the_line() -> None:
     assert "`y = x / 0`" in str(refusal("x = 1\ny = x / 0\nz = 2"))
 
 
-def test_a_name_that_is_nearly_known_is_suggested() -> None:
+def test_similar_known_names_are_suggested() -> None:
     assert "did you mean 'detect'" in refusal("x = detekt('bowl')").reason
     assert "did you mean np.linalg.norm" in refusal("x = np.linalg.nrom([1])").reason
 
@@ -225,7 +225,7 @@ PYTHON = (
 
 
 @pytest.mark.parametrize("source", PYTHON)
-def test_honest_python_means_what_python_means(source: str) -> None:
+def test_allowed_python_gives_pythons_results(source: str) -> None:
     expected: dict[str, Any] = {}
     exec(source, {}, expected)
     assert dict(variables(source)) == expected
@@ -276,7 +276,7 @@ NUMPY = (
 
 
 @pytest.mark.parametrize("expression", NUMPY)
-def test_honest_numpy_means_what_numpy_means(expression: str) -> None:
+def test_allowed_numpy_gives_numpys_results(expression: str) -> None:
     expected = eval(expression, {"np": np})
     found = variables(f"x = {expression}")["x"]
     np.testing.assert_array_equal(found, expected)
@@ -306,7 +306,7 @@ def marked(source: str) -> list[list[int]]:
         ("detect('bowl').position", [20, 30, 40]),
     ],
 )
-def test_an_index_into_a_map_is_made_to_fit(index: str, voxel: list[int] | None) -> None:
+def test_map_indices_are_rounded_and_clipped(index: str, voxel: list[int] | None) -> None:
     if voxel is None:
         assert refusal(f"m = get_map()\nm[{index}] = 1").rule == "names"
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,8 +15,9 @@ from vecenv_eval.drive import drive
 from vecenv_eval.policies import extras_of, make_policy
 
 import vecenv
-from vecenv.contract import ObjectsSnapshot
+from vecenv.contract import BatchEnv
 from vecenv.manipulation.routes import RouteConfig
+from vecenv.observations import ObjectsSnapshot
 from voxposer.agent import Agent, AgentConfig
 from voxposer.interface import Interface
 from voxposer.language.llm import Llm
@@ -88,7 +89,7 @@ def test_the_second_motion_starts_where_the_first_ends() -> None:
     assert interface.functions()["get_empty_gripper_map"]().max() == 0  # the next map starts out closed
 
 
-def test_a_subtask_begins_with_nothing_asked_for() -> None:
+def test_a_subtask_begins_without_requests() -> None:
     interface = begin()
     interface.reset_to_default_pose()
     interface.begin(interface.perception)
@@ -103,13 +104,13 @@ def test_a_subtask_begins_with_nothing_asked_for() -> None:
         ({"rotation_map": np.full((100, 100, 100, 4), np.nan)}, "rotation map holds values that are not finite"),
     ],
 )
-def test_maps_that_make_no_sense_are_named(arguments: dict[str, Any], says: str) -> None:
+def test_invalid_maps_are_reported(arguments: dict[str, Any], says: str) -> None:
     interface = begin()
     with pytest.raises(InterfaceError, match=says):
         interface.execute(interface.detect("gripper"), **arguments)
 
 
-def test_a_thing_needs_somewhere_to_go_and_must_not_be_fixed() -> None:
+def test_a_pushed_object_needs_a_target_and_must_be_movable() -> None:
     interface = begin(snapshot({**CUBE, "stove_1": box((0.1, 0.1, 0.02), (-0.2, 0, 0.02))}, fixed=("stove_1",)))
     with pytest.raises(InterfaceError, match="cube_1 is to move"):
         interface.execute(interface.detect("cube_1"))
@@ -186,7 +187,7 @@ def test_several_slots_are_planned_together_as_they_are_alone() -> None:
         np.testing.assert_array_equal(np.round(np.asarray(a)[-1]), [60 + 10 * i, 40, 40])
 
 
-def test_the_scene_is_in_the_way_of_a_travelling_hand_and_not_of_a_pulling_one() -> None:
+def test_the_scene_is_an_obstacle_for_a_travelling_hand_but_not_a_pulling_one() -> None:
     bar = handle()
     held = snapshot(
         {"cabinet_1": box((0.1, 0.1, 0.11), (0.2, -0.02, 0.11)), "tower_1": box((0.04, 0.04, 0.2), (-0.3, 0.3, 0.2))},
@@ -250,10 +251,10 @@ REPLIES = {
 
 def agent(env: Obedient, words: tuple[str, ...], **options: Any) -> tuple[Agent, Scripted]:
     llm = Scripted(dict(sorted(REPLIES.items(), key=lambda item: -len(item[0]))))
-    return Agent(env, words, llm, AgentConfig(passes=1, **options)), llm
+    return Agent(cast(BatchEnv, env), words, llm, AgentConfig(passes=1, **options)), llm
 
 
-def test_each_subtask_is_planned_on_what_is_there_then() -> None:
+def test_each_subtask_is_planned_on_the_present_state() -> None:
     env = Obedient(snapshot(CUBE))
     acting, _ = agent(env, ("lift",))
     acting.step()
@@ -273,10 +274,10 @@ def test_a_slot_whose_program_fails_does_not_stop_the_others() -> None:
     assert env.plans[0].valid.any(axis=1).tolist() == [False, True]
 
 
-def test_an_instruction_that_was_followed_to_the_end_is_planned_anew_as_often_as_allowed() -> None:
+def test_an_unsolved_instruction_is_planned_again_up_to_the_pass_limit() -> None:
     env = Obedient(snapshot(CUBE), budget=400)
     llm = Scripted(dict(sorted(REPLIES.items(), key=lambda item: -len(item[0]))))
-    acting = Agent(env, ("lift",), llm, AgentConfig(passes=2))
+    acting = Agent(cast(BatchEnv, env), ("lift",), llm, AgentConfig(passes=2))
     control = acting.step()
     while not control.done.all():
         control = acting.step()
@@ -302,7 +303,7 @@ def test_the_policy_reports_what_an_episode_took() -> None:
     env = Obedient(snapshot(CUBE), budget=300)
     acting, _ = agent(env, ("lift",))
     policy.agent = acting  # pyright: ignore[reportAttributeAccessIssue]
-    list(drive(env, policy))
+    list(drive(cast(BatchEnv, env), policy))
     said = extras_of(policy, 0)
     assert said["subtasks"] == 2
     assert said["llm_calls"] == len(acting.slots[0].lmps.trace) > 3
@@ -311,7 +312,7 @@ def test_the_policy_reports_what_an_episode_took() -> None:
     assert said["cause"] == "followed to the end without success"
 
 
-def test_maps_and_snapshots_are_let_go_of_without_the_cycle_collector() -> None:
+def test_maps_and_snapshots_are_freed_without_the_cycle_collector() -> None:
     env = Obedient(snapshot(CUBE), budget=300)
     acting, _ = agent(env, ("lift",))
     gc.collect()
@@ -343,7 +344,7 @@ def plate(x: float = 0.0) -> Perception:
     return begin(snapshot({"plate_1": box((0.07, 0.07, 0.02), (x, 0, 0.02))}), closed=True).perception
 
 
-def test_a_push_comes_from_behind_and_begins_before_the_thing() -> None:
+def test_a_push_comes_from_behind_and_starts_before_the_object() -> None:
     pushing = PushTask("plate_1", np.array([[0.2, 0.0, 0.02]]))
     (stops,) = next_pushes([situation(pushing, plate(), PushingConfig())], PushingConfig())
     xs = [stop.pos[0] for stop in stops]
@@ -354,7 +355,7 @@ def test_a_push_comes_from_behind_and_begins_before_the_thing() -> None:
     assert pushing.pushes == 1
 
 
-def test_places_that_a_thing_has_passed_are_passed_over() -> None:
+def test_waypoints_that_the_object_has_passed_are_skipped() -> None:
     way = np.array([[0.05, 0, 0.02], [0.1, 0, 0.02], [0.3, 0, 0.02]])
     pushing = PushTask("plate_1", way)
     assert not arrived(pushing, plate(0.07))
@@ -363,7 +364,7 @@ def test_places_that_a_thing_has_passed_are_passed_over() -> None:
     assert arrived(PushTask("plate_1", way, pushes=PushingConfig().most), plate())
 
 
-def test_a_push_in_vain_is_not_repeated() -> None:
+def test_a_failed_push_is_not_repeated() -> None:
     pushing = PushTask("plate_1", np.array([[0.2, 0.0, 0.02]]))
     before = situation(pushing, plate(), PushingConfig())
     next_pushes([before], PushingConfig())
@@ -379,7 +380,7 @@ def test_a_push_in_vain_is_not_repeated() -> None:
     assert pushing.failed == []
 
 
-def test_a_thing_against_a_wall_is_pushed_aside_first() -> None:
+def test_an_object_against_a_wall_is_pushed_aside_first() -> None:
     wall = {"wall_1": box((0.005, 0.4, 0.15), (-0.082, 0, 0.15), 8000)}
     seen = begin(snapshot({"plate_1": box((0.07, 0.07, 0.02), (0, 0, 0.02)), **wall}, ("wall_1",))).perception
     found = situation(PushTask("plate_1", np.array([[0.45, 0.0, 0.02]])), seen, PushingConfig())
@@ -387,7 +388,7 @@ def test_a_thing_against_a_wall_is_pushed_aside_first() -> None:
     assert found.free.any()
 
 
-def test_a_thing_with_walls_all_around_cannot_be_pushed() -> None:
+def test_an_object_enclosed_by_walls_cannot_be_pushed() -> None:
     walls = {
         f"wall_{i}": box((0.02, 0.2, 0.15) if i < 2 else (0.2, 0.02, 0.15), (*centre, 0.15), 4000)
         for i, centre in enumerate([(-0.1, 0), (0.1, 0), (0, -0.1), (0, 0.1)])
@@ -403,7 +404,7 @@ def test_a_batch_ends_as_its_episodes_do_one_at_a_time() -> None:
         env = vecenv.make("libero_object", task=0, episodes=episodes)
         policy = make_policy("voxposer")
         policy.reset(env, env.reset())
-        for _ in drive(env, policy):
+        for _ in drive(cast(BatchEnv, env), policy):
             pass
         found = env.evaluate()
         env.close()
@@ -419,6 +420,6 @@ def test_pushing_language_moves_the_plate_by_pushes() -> None:
     env = vecenv.make("libero_goal", task=5, episodes=[0])
     policy = make_policy("voxposer")
     policy.reset(env, env.reset())
-    for _ in drive(env, policy):
+    for _ in drive(cast(BatchEnv, env), policy):
         pass
     assert env.evaluate().success.all()

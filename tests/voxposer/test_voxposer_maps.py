@@ -15,7 +15,7 @@ from support import voxposer_reference as reference
 
 from voxposer.planning import maps
 
-pytestmark = pytest.mark.usefixtures("explicit_ranks")
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 
 LOWER, UPPER = np.array([-0.7, -0.4, 0.812]), np.array([0.3, 0.5, 1.262])
 # SciPy's wheels for other machines may fuse multiplications and additions.
@@ -42,7 +42,7 @@ def test_numpy_stays_numpy_and_jax_may_be_traced() -> None:
     np.testing.assert_array_equal(traced, voxels)
 
 
-def test_bad_points_and_bounds_are_named() -> None:
+def test_invalid_points_and_bounds_are_reported() -> None:
     with pytest.raises(ValueError, match="1 of the points are not finite"):
         maps.to_voxel(np.array([[0, 0, 1], [0, np.nan, 1]]), LOWER, UPPER)
     with pytest.raises(ValueError, match="upper > lower"):
@@ -125,7 +125,7 @@ def _scene(size: int = 100) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return avoidance, scene, affordance
 
 
-def test_the_scene_is_no_obstacle_near_targets_and_near_the_thing_that_moves() -> None:
+def test_the_scene_is_no_obstacle_near_targets_and_the_moving_object() -> None:
     avoidance, scene, affordance = _scene()
     movable = np.zeros_like(avoidance)
     movable[30:35, 40:45, 20:25] = 1
@@ -161,7 +161,7 @@ def test_without_targets_the_scene_counts_everywhere_but_at_the_start() -> None:
     np.testing.assert_array_equal(found[10:] > 0, (scene | (avoidance > 0))[10:])
 
 
-def test_the_thing_that_moves_must_be_given_in_one_way() -> None:
+def test_the_moving_object_must_be_given_in_one_way() -> None:
     avoidance, scene, affordance = _scene(50)
     with pytest.raises(ValueError, match="either movable"):
         maps.preprocess_avoidance(avoidance, scene, affordance)

@@ -17,6 +17,8 @@ from vecenv.manipulation.routes import RouteConfig, Stop, corners, is_contact_mo
 from vecenv.manipulation.world import Margins, SceneGeometry
 from voxposer.planning.plan import PlanConfig, PlannedWaypoint, expand_flips, remaining, slowed, stack
 
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
+
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])
 CONFIG = PlanConfig(settle=2, lengths=4)
 
@@ -32,7 +34,7 @@ def row(x: float, *, closed: bool = False, hold: int = 0) -> PlannedWaypoint:
 # -- grip --------------------------------------------------------------------------------------------------------------
 
 
-def test_a_flip_is_driven_to_with_the_old_grip_and_then_held_for() -> None:
+def test_a_grip_change_is_reached_with_the_old_grip_then_held() -> None:
     rows, closed = expand_flips([stop(0.1), stop(0.2, closed=True), stop(0.3, closed=True)], False, 5, CONFIG)
     assert closed
     flip = next(i for i, r in enumerate(rows) if r.hold)
@@ -53,13 +55,13 @@ def test_the_grip_carries_over_from_one_plan_to_the_next() -> None:
     assert sum(r.hold > 0 for r in rows) == 1
 
 
-def test_the_end_of_a_path_is_come_to_exactly_by_repeating_it() -> None:
+def test_the_end_of_a_path_is_repeated_to_reach_it_exactly() -> None:
     rows, _ = expand_flips([stop(0.1), stop(0.2, final=True)], False, 0, CONFIG)
     assert [r.pose[0] for r in rows] == [0.1, 0.2, 0.2, 0.2]
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=8), st.booleans())
-def test_every_flip_is_held_for_once_and_only_flips_are(grips: list[bool], before: bool) -> None:
+def test_every_grip_change_is_held_once_and_nothing_else(grips: list[bool], before: bool) -> None:
     rows, after = expand_flips([stop(0.01 * i, closed=g) for i, g in enumerate(grips)], before, 0, CONFIG)
     flips = sum(a != b for a, b in zip([before, *grips[:-1]], grips, strict=True))
     assert sum(r.hold > 0 for r in rows) == flips
@@ -70,7 +72,7 @@ def test_every_flip_is_held_for_once_and_only_flips_are(grips: list[bool], befor
         seen = r.closed
 
 
-def test_a_slow_way_has_waypoints_close_together() -> None:
+def test_slow_motions_have_closely_spaced_waypoints() -> None:
     quick, slow = ([stop(0.0), stop(0.1, velocity=v)] for v in (1.0, 0.2))
     assert len(slowed(quick)) == 2
     xs = np.array([s.pos[0] for s in slowed(slow)])
@@ -92,11 +94,11 @@ def test_a_plan_is_a_pytree_that_step_waypoints_takes() -> None:
     np.testing.assert_array_equal(checked.hold[0], [0, 60, 0, 0])
 
 
-def test_a_plan_of_nothing_is_a_plan() -> None:
+def test_an_empty_plan_is_valid() -> None:
     assert not stack([[], []], CONFIG).valid.any()
 
 
-def test_a_hand_that_is_stuck_goes_on_where_the_grip_changes_next() -> None:
+def test_a_stuck_hand_resumes_at_the_next_grip_change() -> None:
     rows = [row(0.1), row(0.2), row(0.3), row(0.3, closed=True, hold=60), row(0.5, closed=True)]
     plan = stack([rows, rows], PlanConfig(lengths=1))
     ticks = np.array([[20, 100, 0, 0, 0], [20, 5, 5, 60, 30]])
@@ -108,9 +110,7 @@ def test_a_hand_that_is_stuck_goes_on_where_the_grip_changes_next() -> None:
 
 
 @given(st.lists(st.tuples(*[st.floats(-1, 1)] * 3), min_size=2, max_size=30), st.floats(0.01, 0.3))
-def test_thinning_keeps_the_ends_and_strays_no_further_than_allowed(
-    points: list[tuple[float, float, float]], tolerance: float
-) -> None:
+def test_thinning_keeps_the_ends_and_the_tolerance(points: list[tuple[float, float, float]], tolerance: float) -> None:
     path = np.array(points)
     kept = corners(path, tolerance, np.zeros(len(path), bool))
     assert kept[0] == 0
@@ -134,7 +134,7 @@ def travel(stops: list[Stop], world: SceneGeometry, held: str = "") -> list[Stop
     return travel_route(stops, (down, down), world, held, RouteConfig())
 
 
-def test_a_travelling_hand_goes_over_what_lies_on_its_way() -> None:
+def test_a_travelling_hand_passes_over_obstacles() -> None:
     stops = [stop(0.0, 0.1), stop(0.2, 0.1), stop(0.4, 0.05, final=True)]
     route = travel(stops, tower_world())
     assert route[0].pos[0] == 0.0  # up first
@@ -146,7 +146,7 @@ def test_a_travelling_hand_goes_over_what_lies_on_its_way() -> None:
     assert not any(s.final for s in route[:-1])
 
 
-def test_what_hangs_from_the_hand_is_carried_over_as_well() -> None:
+def test_what_hangs_from_the_hand_clears_obstacles_too() -> None:
     world = SceneGeometry(
         snapshot(
             {"tower_1": box((0.03, 0.03, 0.125), (0.2, 0, 0.125)), "bottle_1": box((0.02, 0.02, 0.1), (0, 0, 0.1))},
@@ -169,7 +169,7 @@ def test_straight_up_is_no_detour() -> None:
     assert len(route) == 1
 
 
-def test_what_something_hangs_over_is_moved_aside_before_it_goes_up() -> None:
+def test_an_object_under_an_overhang_is_moved_aside_before_lifting() -> None:
     plank = box((0.1, 0.1, 0.01), (0.0, 0.11, 0.15), 2000)
     things = {"plank_1": plank, "cube_1": box((0.02, 0.02, 0.02), (0, 0, 0.03))}
     world = SceneGeometry(snapshot(things, ee_pose=np.array([0, 0, 0.05, *DOWN])), Margins())
@@ -190,7 +190,7 @@ def test_a_tilted_hand_comes_along_its_own_axis() -> None:
     np.testing.assert_allclose(before / np.linalg.norm(before), -tilt, atol=1e-6)
 
 
-def test_only_a_closed_hand_without_a_thing_works() -> None:
+def test_only_a_closed_empty_hand_is_in_contact() -> None:
     start, level, down = np.array([0, 0, 0.2]), np.array([0.15, 0, 0.2]), np.array([0.15, 0, 0.05])
     options = {"held": "", "attached": "", "config": RouteConfig()}
     assert is_contact_move(start, level, closed=True, **options)
@@ -200,7 +200,7 @@ def test_only_a_closed_hand_without_a_thing_works() -> None:
     assert not is_contact_move(start, level, closed=True, **{**options, "held": "cube_1"})
 
 
-def test_a_working_hand_follows_its_path() -> None:
+def test_a_hand_in_contact_follows_its_path() -> None:
     bent = [stop(0.0), stop(0.1), Stop(np.array([0.1, 0.1, 0.3]), DOWN, True, 1.0, True)]
     assert [tuple(s.pos) for s in work_route(bent)] == [tuple(s.pos) for s in bent]
     straight = [stop(0.0), stop(0.1, 0.301), stop(0.2, final=True)]

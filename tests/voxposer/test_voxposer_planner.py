@@ -19,7 +19,7 @@ from voxposer.planning import planner
 from voxposer.planning.config import Fault, PlannerConfig
 from voxposer.planning.planner import Paths, optimize_paths
 
-pytestmark = pytest.mark.usefixtures("explicit_ranks")
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 
 Engine = Literal["jax", "numba"]
 ENGINES: tuple[Engine, ...] = ("jax", "numba")
@@ -98,7 +98,7 @@ ONE_STEP = {"max_steps": 1, "savgol_window_size": 1, "pushing_skip_per_k": 1}
         ("jax", OTHER_COSTS | OTHER_WINDOW | OTHER_ENDS),
     ],
 )
-def test_every_number_of_the_configuration_counts_as_in_the_reference(engine: Engine, change: dict[str, Any]) -> None:
+def test_every_option_acts_as_in_the_reference(engine: Engine, change: dict[str, Any]) -> None:
     config = replace(DEFAULT, **change)
     problems = draw(SLOTS, 60, seed=20) + draw(SLOTS, 60, seed=21) * (engine == "numba")
     require_equal(plan(problems, engine, config), problems, config)
@@ -153,7 +153,7 @@ def test_waypoints_stay_in_the_grid_and_steps_are_short(seed: int) -> None:
 
 @settings(max_examples=25)
 @given(start=voxels, target=voxels)
-def test_with_nothing_in_the_way_a_hand_goes_straight_to_the_target(start: tuple[int, ...], target: Any) -> None:
+def test_without_obstacles_a_path_is_straight(start: tuple[int, ...], target: Any) -> None:
     paths = plan([open_space(start, target)], "numba")
     raw = paths.raw[0, : paths.raw_length[0]]
     distance = np.linalg.norm(raw - np.asarray(target), axis=1)
@@ -174,7 +174,7 @@ def test_moving_everything_moves_the_path(start: Any, target: Any, shift: Any) -
     np.testing.assert_allclose(there.path[0, :length], here.path[0, :length] + np.array(shift), atol=1e-4)
 
 
-def test_a_path_keeps_away_from_what_is_in_its_way() -> None:
+def test_a_path_avoids_obstacles() -> None:
     problem = open_space((10, 50, 50), (90, 50, 50), size=100)
     problem.obstacle[45:55, 40:56, 40:60] = 1
     free = plan([replace(problem, obstacle=np.zeros_like(problem.obstacle))], "numba")
@@ -205,7 +205,7 @@ def test_a_batch_may_be_cut_into_parts_that_do_not_divide_it() -> None:
         jax.tree.map(np.testing.assert_array_equal, parts, double(values, more))
 
 
-def test_slots_in_step_within_a_larger_function_are_as_slots_one_by_one() -> None:
+def test_slots_traced_in_a_larger_function_equal_single_slots() -> None:
     arrays = reference.stack(draw(SLOTS, SMALL, seed=31))
 
     @jax.jit
@@ -248,7 +248,7 @@ def test_behind_its_end_a_path_repeats_its_last_entry(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_slot_that_cannot_be_planned_says_why_and_spoils_no_other(engine: Engine) -> None:
+def test_a_slot_without_a_path_reports_why_and_affects_no_other(engine: Engine) -> None:
     good, lost, broken, torn, nowhere = draw(SLOTS, SMALL, seed=33)
     lost, broken = replace(lost, target=0 * lost.target), replace(broken, obstacle=broken.obstacle + np.nan)
     torn = replace(torn, target=np.where(torn.target == 1, np.inf, 0))
@@ -299,7 +299,8 @@ def test_an_empty_batch_has_no_paths() -> None:
     assert [x.shape for x in traced] == [x.shape for x in paths]
 
 
-def test_shapes_that_do_not_fit_are_named() -> None:
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_mismatched_shapes_are_reported() -> None:
     start, grid, moved = np.zeros((2, 3)), np.zeros((2, SMALL, SMALL, SMALL)), np.zeros(2, bool)
     with pytest.raises(ValueError, match="start must have shape"):
         optimize_paths(start[:, :2], grid, grid, moved)
@@ -315,6 +316,6 @@ def test_shapes_that_do_not_fit_are_named() -> None:
     "change",
     [{"stop_criteria": "never"}, {"max_steps": 0}, {"savgol_window_size": 0}, {"obstacle_map_gaussian_sigma": -1}],
 )
-def test_numbers_out_of_range_are_named(change: dict[str, Any]) -> None:
+def test_numbers_out_of_range_are_reported(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(change))):
         PlannerConfig(**change)

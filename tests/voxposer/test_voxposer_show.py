@@ -46,7 +46,7 @@ def shown(**changes: object) -> EpisodeRecord:
     return EpisodeRecord(**values)  # pyright: ignore[reportArgumentType]
 
 
-def test_a_motion_shows_its_targets_path_and_way() -> None:
+def test_a_motion_shows_targets_planned_path_and_hand_route() -> None:
     (motion,) = planned()
     found = layers(motion)
     assert found["targets"].shape == (1, 3)
@@ -55,7 +55,7 @@ def test_a_motion_shows_its_targets_path_and_way() -> None:
     assert len(found["surface"]) > 500
 
 
-def test_the_page_has_every_program_and_where_it_came_from() -> None:
+def test_the_page_has_every_program_and_its_source() -> None:
     page = render_page(shown())
     for text in ("execute(&#x27;&lt;b&gt;&#x27;)", "from the cache", "went wrong", "0.2500 US dollars", "lift higher"):
         assert text in page

@@ -60,7 +60,7 @@ def test_instructions_are_understood_by_the_names_of_the_scene(seen: Any) -> Non
         assert set(snapshot.movable) <= set(snapshot.objects) == set(snapshot.poses)
 
 
-def test_a_scene_without_samples_of_its_table_gets_some(seen: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_samples_are_added_to_a_scene_without_them(seen: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Upstream's own stages are meshes, of which a snapshot has no points."""
     snapshot = seen.env.observe_objects().snapshot[1]
     clouds = list(snapshot.objects.values())
@@ -70,7 +70,7 @@ def test_a_scene_without_samples_of_its_table_gets_some(seen: Any, monkeypatch: 
     assert SceneGeometry(shown, AgentConfig().perception.margins).ground(np.array([-0.16, 0.0])) == pytest.approx(low)
 
 
-def test_a_hand_moves_to_where_it_is_told(seen: Any) -> None:
+def test_a_hand_moves_to_its_target(seen: Any) -> None:
     start = np.stack([snapshot.ee_pose for snapshot in seen.observe_objects().snapshot])
     targets = np.concatenate([start, np.zeros((4, 1))], axis=1)
     targets[:, :3] += [-0.02, 0.02, 0.03]
@@ -88,7 +88,7 @@ def test_waiting_keeps_the_grip_in_liberos_sign(seen: Any, sign: float, gap: flo
         assert snapshot.gripper[0] - snapshot.gripper[1] == pytest.approx(gap, abs=2e-3)
 
 
-def test_other_environments_are_left_as_they_are_and_other_robots_refused() -> None:
+def test_other_environments_pass_through_and_other_robots_are_refused() -> None:
     env, config = object(), AgentConfig()
     assert hands(env, "libero_goal", config) == (env, config)  # type: ignore[arg-type]
     with pytest.raises(NoHandView, match="simpler/bridge of SIMPLER's suites, not simpler/google_robot"):

@@ -10,10 +10,12 @@ and Kröger 2021); their evaluation is vectorised over slots, substeps and dofs.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
 from vecenv.errors import InvalidInput
 
@@ -67,7 +69,7 @@ class Profiles:
     duration: np.ndarray
     planned: np.ndarray
 
-    def sample(self, times: Any) -> tuple[np.ndarray, np.ndarray]:
+    def sample(self, times: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Positions (radians) and velocities (rad/s), [B, S, D] each; what comes after arrival is the arrival.
 
         Args:
@@ -111,7 +113,7 @@ class Planner:
         self._ok = (ruckig.Result.Working, ruckig.Result.Finished)
         self._error = ruckig.RuckigError
 
-    def plan(self, start: Any, velocity: Any, target: Any) -> Profiles:
+    def plan(self, start: npt.ArrayLike, velocity: npt.ArrayLike, target: npt.ArrayLike) -> Profiles:
         """Paths that begin without acceleration and end at rest.
 
         Args:
@@ -154,7 +156,32 @@ class Planner:
             return False
 
 
-def _phases(profile: Any) -> list[list[float]]:
+@runtime_checkable
+class _Phases(Protocol):
+    """Consecutive phases of one dof, as ``ruckig`` gives them: durations, and the values at their beginnings."""
+
+    t: Sequence[float]
+    p: Sequence[float]
+    v: Sequence[float]
+    a: Sequence[float]
+    j: Sequence[float]
+
+
+@runtime_checkable
+class _Brake(_Phases, Protocol):
+    """The braking phases, which are all unused if their ``duration`` is 0."""
+
+    duration: float
+
+
+@runtime_checkable
+class _DofProfile(_Phases, Protocol):
+    """The path of one dof: seven phases, and the braking phases before them."""
+
+    brake: _Brake
+
+
+def _phases(profile: _DofProfile) -> list[list[float]]:
     """Begin, position, velocity, acceleration and jerk of the phases of one dof, [5][10]."""
     brake = profile.brake
     begin = [0.0, *itertools.accumulate((*brake.t, *profile.t))]
@@ -171,7 +198,7 @@ def _phases(profile: Any) -> list[list[float]]:
     ]
 
 
-def _rows(name: str, value: Any, dofs: int) -> np.ndarray:
+def _rows(name: str, value: npt.ArrayLike, dofs: int) -> np.ndarray:
     rows = np.asarray(value, np.float64)
     if rows.ndim != 2 or rows.shape[1] != dofs:
         raise InterpolationError(f"{name} must have shape [B, {dofs}], got {list(rows.shape)}")

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -119,8 +119,8 @@ def set_goal(
     """Set the goal from a policy action, as ``OperationalSpaceController.set_goal`` does once per control tick.
 
     The goal is relative to where the arm *is*, not to the previous goal. The orientation goal is kept when all three
-    rotation components are exactly 0 (robosuite compares with zero absolute tolerance), so an arm told not to rotate
-    returns to its last commanded orientation.
+    rotation components are exactly 0 (robosuite compares with zero absolute tolerance), so an arm whose action
+    does not rotate returns to its last commanded orientation.
 
     Args:
         arm: current arm; only ``eef_pos`` and ``eef_mat`` are read.
@@ -146,7 +146,7 @@ def set_goal(
 def _robosuite_rotation(rotvec: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
     """Rotation matrix of a rotation vector with robosuite's rounding (``quat2mat(axisangle2quat(v))``).
 
-    ``quat2mat`` works in float32 whatever it is given, which moves a goal by up to 1e-7 rad. The same roundings are
+    ``quat2mat`` computes in float32 for any input, which moves a goal by up to 1e-7 rad. The same roundings are
     made here, in the order compiled robosuite makes them, so float64 goals agree to the last bits.
     """
     angle = safe_norm(rotvec)[..., None]
@@ -176,7 +176,7 @@ def _round_to_float32(x: jax.Array) -> jax.Array:
 
 
 @_round_to_float32.defjvp
-def _round_to_float32_jvp(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+def _round_to_float32_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
     return _round_to_float32(*primals), tangents[0]
 
 

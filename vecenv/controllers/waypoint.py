@@ -5,11 +5,11 @@ tick and the reference the next tick starts from. Everything is a pure function 
 xyz in metres, unit quaternions wxyz, world frame.
 
 The servo carries a *reference*: a pose that starts at the hand and moves towards the target by at most 5 mm and
-0.05 rad a tick. The action asks the OSC, whose goals are relative to the present pose, for the way from the hand to the
-reference.
+0.05 rad a tick. The action is the offset from the hand to the reference, because goals of the OSC are relative to the
+present pose.
 
-Why not simply ask for 5 mm from wherever the hand is? Because the OSC is a damped spring that never catches up with a
-goal that is always 5 mm away: the hand settles at ``kp / kd`` = 6.1 /s times 5 mm, which is 1.5 mm a 50 ms tick. On
+A goal that is always 5 mm ahead of the hand would be too slow, because the OSC is a damped spring that never catches up
+with it: the hand settles at ``kp / kd`` = 6.1 /s times 5 mm, which is 1.5 mm a 50 ms tick. On
 robosuite's own simulation (libero_object task 0, 20 cm sideways) that took 154 ticks, past the default budget of 100;
 carrying the reference took 41 at 5.0 mm a tick, and a 1.5 rad turn 33 instead of 117. Travelling at 5 mm a tick the
 hand trails the reference by ``kd / kp`` times the speed: 16 mm, 0.16 rad. ``max_lead_pos`` and ``max_lead_rot`` bound
@@ -179,7 +179,7 @@ def pose_error(current: Pose, target: Pose) -> tuple[Float[Array, ...], Float[Ar
 def converged(current: Pose, target: Pose, config: WaypointConfig = STEP_EE_POSE) -> Bool[Array, ...]:
     """Bool [...]: position and rotation are both within tolerance.
 
-    To be asked after a tick: a call then uses at least one, and its gripper command is always given.
+    Evaluate it after a tick: a call then takes at least one tick, and its gripper command is always applied.
     """
     distance, angle = pose_error(current, target)
     return (distance <= config.pos_tol) & (angle <= config.rot_tol)

@@ -24,10 +24,11 @@ from gymnasium.vector.utils import batch_space
 
 import vecenv
 from vecenv import placement, protocols
-from vecenv.contract import ACTION_DIM, Control, Rendered, ResetInfo
+from vecenv.contract import ACTION_DIM, Control, ResetInfo
 from vecenv.errors import InvalidInput
 from vecenv.interop.episodes import num_episodes
 from vecenv.interop.observing import Batch
+from vecenv.observations import Rendered
 
 # The names of the cameras' images in LeRobot's LIBERO data sets and checkpoints.
 CAMERA_NAMES: Mapping[str, str] = {"agentview": "image", "wrist": "image2"}

@@ -13,12 +13,12 @@ import numpy as np
 from gymnasium import spaces
 
 import vecenv
-from vecenv.contract import Egocentric, Rendered
 from vecenv.errors import InvalidInput
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.physics.base import Group
 from vecenv.libero.render.options import POLICY_CAMERAS
 from vecenv.libero.scene.scene import Scene
+from vecenv.observations import Egocentric, Rendered
 
 if TYPE_CHECKING:
     from vecenv.simpler.env import SimplerEnv

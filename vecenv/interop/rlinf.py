@@ -21,10 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 import vecenv
-from vecenv.contract import ACTION_DIM, Rendered
+from vecenv.contract import ACTION_DIM
 from vecenv.errors import InvalidInput, MissingDependency
 from vecenv.interop.reset_states import ResetStates
 from vecenv.interop.scattered import ScatteredBatch
+from vecenv.observations import Rendered
 
 try:
     import torch  # pyright: ignore[reportMissingImports]

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 import vecenv
-from vecenv.contract import ACTION_DIM, Egocentric, Rendered
+from vecenv.contract import ACTION_DIM
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.tasks.suites import list_tasks
+from vecenv.observations import Egocentric, Rendered
 
 
 class _Part:

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv import protocols
-from vecenv.contract import Control, Egocentric, Objects, State
+from vecenv.contract import Control, State
 from vecenv.controllers import waypoint
 from vecenv.libero import observe, starts
 from vecenv.libero.config import LiberoConfig, LiberoError
@@ -33,6 +33,7 @@ from vecenv.libero.tasks import fixtures as fixture_poses
 from vecenv.libero.tasks.export import exported_tasks
 from vecenv.libero.tasks.sources import Task, installed_tasks
 from vecenv.libero.tasks.suites import NUM_EPISODES
+from vecenv.observations import Egocentric, Objects
 from vecenv.slots import SlotBatch
 
 
@@ -58,7 +59,7 @@ class LiberoEnv(SlotBatch):
         config: options.
 
     Raises:
-        LiberoError, SceneError, GoalError, FixtureError, TaskDataError: something the options ask for does not exist.
+        LiberoError, SceneError, GoalError, FixtureError, TaskDataError: an option names something that does not exist.
     """
 
     _error = LiberoError
@@ -74,13 +75,13 @@ class LiberoEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
+    def _chosen(self, tasks: object, episodes: object) -> placing.Placement:
         counts = {"num_tasks": len(self._sources), "num_episodes": NUM_EPISODES}
         indices = None if tasks is None else placing.task_indices(tasks, [source.name for source in self._sources])
         return placing.each(indices, episodes, self._placement, **counts)
 
     def _prepare(self) -> np.ndarray:
-        """Scenes, physics and goal tables for the current placement; what still fits is kept."""
+        """Scenes, physics and goal tables for the current placement; physics that still fits is reused."""
         keys = list(dict.fromkeys(self._sources[int(i)].problem().scene_key() for i in np.unique(self._placement.task)))
         # Every task of the suite that shares a scene, so that a slot may change its task without another model.
         every = {index: source.problem() for index, source in enumerate(self._sources)}
@@ -127,7 +128,7 @@ class LiberoEnv(SlotBatch):
         return self._sources[min(sharing)].scene(goals.contact_pairs(sharing.values()), lean_for, self.config.contacts)
 
     def _exact_scene(self, group: Group) -> Scene:
-        """A group's scene with upstream's collision geoms, whatever its physics has."""
+        """A group's scene with upstream's collision geoms, also when its physics uses lean ones."""
         if self.config.geometry == "exact":
             return group.scene
         problems = {i: task.problem for i, task in self._tasks.items()}
@@ -183,7 +184,7 @@ class LiberoEnv(SlotBatch):
 
     # -- stepping ------------------------------------------------------------------------------------------------------
 
-    def step_continuous(self, actions: Any) -> Control:
+    def step_continuous(self, actions: npt.ArrayLike) -> Control:
         """Advance by one control tick, or by a chunk of K.
 
         Args:
@@ -236,7 +237,7 @@ class LiberoEnv(SlotBatch):
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
-    def observe_egocentric(self, slots: Any = None) -> Egocentric:
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
         """Proprioception of every slot, and what its cameras see now; images are rendered when they are read.
 
         Args:
@@ -259,7 +260,9 @@ class LiberoEnv(SlotBatch):
         )
 
     def set_visuals(self, options: VisualOptions | Sequence[VisualOptions]) -> None:
-        """Change how slots look from now on: light, viewpoints, colours, textures. Physics does not notice.
+        """Change the appearance of slots from the next observation on: light, viewpoints, colours, textures.
+
+        Physics is unaffected.
 
         Args:
             options: one for all slots, or B of them; ``VisualOptions()`` is upstream's look.
@@ -270,10 +273,10 @@ class LiberoEnv(SlotBatch):
         self._check_open()
         self._cameras.options = options_of(options, self.num_envs)
 
-    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
+    def observe_objects(self, points: str = "surface", slots: npt.ArrayLike | None = None) -> Objects:
         """Ground truth of every slot.
 
-        Parts are those of upstream's collision geometry with lean geometry, too.
+        Parts are those of upstream's collision geometry, also with lean geometry.
 
         Args:
             points: ``"surface"``, true surface points of the collision geometry (at least 200 a thing, always the same
@@ -349,11 +352,18 @@ class LiberoEnv(SlotBatch):
             qpos[slots, : model.nq], qvel[slots, : model.nv] = group.qpos, group.qvel
         return State(qpos=qpos, qvel=qvel, time=time, nq=nq, nv=nv)
 
-    def set_state(self, state: State | None = None, *, qpos: Any = None, qvel: Any = None, time: Any = None) -> None:
+    def set_state(
+        self,
+        state: State | None = None,
+        *,
+        qpos: npt.ArrayLike | None = None,
+        qvel: npt.ArrayLike | None = None,
+        time: npt.ArrayLike | None = None,
+    ) -> None:
         """Overwrite the physics state of every slot; step counts, verdicts and the controller's memory stay.
 
         Args:
-            state: what ``state()`` returned; or the arrays one by one, what is None stays:
+            state: what ``state()`` returned; or the arrays one by one, of which None leaves the present values:
             qpos: [B, >= nq]. qvel: [B, >= nv]. time: seconds, [B].
 
         Raises:

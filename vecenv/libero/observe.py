@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from vecenv.contract import Objects, ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from vecenv.libero.config import LiberoError
 from vecenv.libero.physics.base import Group, Physics
 from vecenv.libero.scene import surface
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.parts import PartSpec, opening, scene_parts
 from vecenv.libero.scene.scene import Scene
+from vecenv.observations import Objects, ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 
 # The name of the samples that belong to no object or fixture: table and floor.
 _SCENERY = ""

@@ -1,6 +1,6 @@
-"""Start states of episodes: stored or settled init states with the fixture poses that the options ask for.
+"""Start states of episodes: stored or settled init states with the fixture poses of the options.
 
-In: a task, its compiled scene, the options of the batch and which episodes are wanted. Out: a
+In: a task, its compiled scene, the options of the batch and the episodes. Out: a
 ``vecenv.libero.physics.base.Start``, ready to be written into the physics. Also here, because it starts from the same
 states: how much contact memory MJX needs for a scene (``measured_budget``).
 """

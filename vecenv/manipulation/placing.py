@@ -212,9 +212,9 @@ def _entering(out: np.ndarray, config: Margins) -> list[np.ndarray]:
 def _put_in_at(
     world: SceneGeometry, name: str, target: Target, rotation: np.ndarray, obstacles: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Position of a hand so turned [3] that lets the thing stand in the middle of a space; what room there is over it.
+    """Position [3] at which a hand so rotated stands the object in the middle of a space; and the room above it.
 
-    The hand's own size may ask for more height than the thing's.
+    The hand may need more height than the object.
     """
     config = world.config
     hung = (world.points(name) - world.hand) @ (rotation @ world.hand_rotation.T).T

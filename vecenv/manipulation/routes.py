@@ -19,7 +19,7 @@ from vecenv.manipulation.world import SceneGeometry, around
 
 # Hands whose axis has at most this vertical component point down.
 _UPRIGHT = -0.98
-# How far a hand moves aside with a thing over which something hangs, metres.
+# Distances by which a hand moves an object aside from under an overhang, metres.
 _ASIDE = (0.02, 0.04, 0.06, 0.08, 0.10, 0.12)
 
 
@@ -149,7 +149,7 @@ def _from_under(world: SceneGeometry, held: str, hand: np.ndarray) -> np.ndarray
 
 
 def _under(thing: np.ndarray, points: np.ndarray) -> bool:
-    """Whether one of some points is straight above a thing's."""
+    """Whether one of some points is straight above a point of an object."""
     if not len(points):
         return False
     apart = np.linalg.norm(thing[:, None, :2] - points[None, :, :2], axis=2)
@@ -166,7 +166,7 @@ def _direct(way: np.ndarray, axes: tuple[np.ndarray, np.ndarray], config: RouteC
 
 
 def _leave(start: Stop, away: np.ndarray, axis: np.ndarray, height: float, *, crowded: bool) -> list[Stop]:
-    """From where the hand is up to a height: straight, but backwards first where a tilted hand is among things."""
+    """From the present position up to a height: straight, but backwards first where a tilted hand is among objects."""
     if axis[2] < _UPRIGHT or not crowded:
         return [replace(start, pos=_at(start.pos, height))]
     return [replace(start, pos=away), replace(start, pos=_at(away, height))]
@@ -198,7 +198,7 @@ def _hangs(world: SceneGeometry, hand: np.ndarray, held: str) -> float:
 
 
 def _tallest(world: SceneGeometry, path: np.ndarray, held: str, config: RouteConfig) -> float:
-    """Height of the tallest thing within the corridor around a path, [P, 3]."""
+    """Height of the highest point within the corridor around a path, [P, 3]."""
     points = world.others(held)
     highest = -np.inf
     for a, b in itertools.pairwise(path):

@@ -1,8 +1,8 @@
 """Geometry of one snapshot for planning: where objects are, how high they are, and rotations of hands.
 
-An :class:`~vecenv.contract.ObjectsSnapshot` comes in; :class:`SceneGeometry` answers the questions of grasping, placing
-and moving (points of objects and of everything else, the ground, the tallest point along a line). Hands are rotation
-matrices whose third column points out of the palm and whose second is the closing direction.
+An :class:`~vecenv.observations.ObjectsSnapshot` comes in; :class:`SceneGeometry` answers the questions of grasping,
+placing and moving (points of objects and of everything else, the ground, the tallest point along a line). Hands are
+rotation matrices whose third column points out of the palm and whose second is the closing direction.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot, RegionBox
 from vecenv.manipulation.grasps import Gripper
+from vecenv.observations import ObjectsSnapshot, RegionBox
 
 # The hand pointing down with the fingers closing along world y, as a Panda starts.
 HOME_ROTATION = np.diag([1.0, -1.0, -1.0])
@@ -208,7 +208,7 @@ def pinching(towards: np.ndarray, tilt: float, length: np.ndarray, current: np.n
 
 
 def tilted(towards: np.ndarray, tilt: float, current: np.ndarray) -> np.ndarray:
-    """A hand likewise tilted that closes horizontally, across the way it leads, [3, 3]."""
+    """A hand tilted in the same way that closes horizontally, across ``towards``, [3, 3]."""
     return _leading(towards, tilt, current, upright_closing=False)
 
 

@@ -1,4 +1,4 @@
-"""SIMPLER: its 25 tasks on SAPIEN, behind the verbs of ``vecenv.contract``."""
+"""SIMPLER: its 25 tasks on SAPIEN, with the interface of ``vecenv.contract``."""
 
 import warnings
 

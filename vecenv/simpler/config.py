@@ -1,4 +1,4 @@
-"""Options of a SIMPLER batch: one frozen dataclass, the one place of their defaults."""
+"""Options of a SIMPLER batch: one frozen dataclass, the only place of their defaults."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from vecenv.simpler.published.lists import SEED, check_protocol
 from vecenv.simpler.variants import Variant, make_variant
 
 BACKENDS = ("physx_cpu",)
-# What ``vecenv.make`` calls a suite's own CPU physics.
+# Name of the default CPU physics in all suites.
 _NATIVE = "native"
 _NO_CUDA = (
     "backend='physx_cuda' is not supported: SIMPLER runs on backend='physx_cpu' (the default, also called 'native'), "
     "spread over processes by num_threads. SAPIEN's GPU physics needs a PhysX library that is no part of its wheel, "
-    "and vecenv's scenes, controllers and criteria have not been written or tested for it; a GPU does draw the pictures"
+    "and vecenv's scenes, controllers and criteria have not been written or tested for it; a GPU can render the images"
 )
 GRIPPERS = ("native", "binary")
 OVERLAYS = ("background", "none", "blend")
 
 
 class SimplerError(InvalidInput):
-    """An option or call that this environment cannot honour; the message says what would be right."""
+    """An option or call that is not possible; the message lists valid values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,22 +36,21 @@ class SimplerConfig:
     """Options of a SIMPLER batch.
 
     Attributes:
-        backend: ``"physx_cpu"``, also called ``"native"``; ``"physx_cuda"`` is not supported, and says so.
-        num_threads: worker processes that scenes are spread over; 1 steps them in this process. None: one a core,
-            and no more than slots.
-        gripper: ``"native"``, the robot's own convention; or ``"binary"``, 1 closed and 0 open (above or below one
-            half).
-        max_steps: step budget in control ticks; None for each task's own.
+        backend: ``"physx_cpu"``, also called ``"native"``; ``"physx_cuda"`` is not supported and raises.
+        num_threads: worker processes that scenes are spread over; 1 steps them in this process. None: one per
+            core, at most one per slot.
+        gripper: ``"native"``, the robot's own convention; or ``"binary"``, 1 closed and 0 open (threshold 0.5).
+        max_steps: step budget in control ticks; None for that of each task.
         success: ``"first"``: an episode ends when its task is first solved; ``"final"``: at the end of its budget,
             where the verdict is read.
-        servo: speeds and tolerances of ``step_ee_pose``; None for the suite's own.
-        overlay: what replaces the background of pictures: ``"background"``, a photograph, as upstream's visual matching
+        servo: speeds and tolerances of ``step_ee_pose``; None for those of the suite.
+        overlay: what replaces the background of images: ``"background"``, a photograph, as upstream's visual matching
             does; ``"none"``; or ``"blend"``, both at one half.
         shadows: whether lights cast shadows; upstream's do not, except at variant aggregation's cabinets, where they do
             here too.
-        variant: what is different from visual matching's scenes; None for nothing.
+        variant: differences from visual matching's scenes; None for none.
         protocol: which episodes there are, one of ``published.PROTOCOLS``: ``"seed"``, 50 of every task, or one of
-            upstream's lists, which decide robots, scenes, pictures and budgets.
+            upstream's lists, which decide robots, scenes, images and budgets.
         assets: root of the asset tree; None for where ``vecenv assets pull simpler`` puts it.
     """
 
@@ -82,7 +81,7 @@ class SimplerConfig:
                 raise SimplerError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
         object.__setattr__(self, "variant", make_variant(self.variant))
         if check_protocol(self.protocol) != SEED and self.variant is not None:
-            raise SimplerError(f"variant={self.variant}: protocol {self.protocol!r} says itself what varies")
+            raise SimplerError(f"variant={self.variant}: protocol {self.protocol!r} already decides the variants")
         for name in ("num_threads", "max_steps"):
             value = getattr(self, name)
             if value is not None and value < 1:

@@ -1,7 +1,7 @@
-"""The SIMPLER environment: layouts, scenes, controllers and success criteria behind the verbs of ``vecenv.contract``.
+"""The SIMPLER environment: layouts, scenes, controllers and success criteria with the interface of ``vecenv.contract``.
 
 A batch of slots, each with one episode of one task of ``simpler/bridge`` (WidowX, 5 Hz) or ``simpler/google_robot``
-(3 Hz). Read ``vecenv/contract.py`` for what the verbs promise, ``control/controllers.py`` for how an action becomes
+(3 Hz). Read ``vecenv/contract.py`` for what the methods promise, ``control/controllers.py`` for how an action becomes
 set-points, ``physics/scenes.py`` for physics and ``judge.py`` for success. One robot serves all tasks of a suite, so
 actions of the whole batch become set-points in one call; scenes are stepped one by one, in worker processes.
 
@@ -15,15 +15,15 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
-from vecenv.contract import Control, Egocentric, Objects, Rendered, State
+from vecenv.contract import Control, State
 from vecenv.controllers.waypoint import WaypointPlan
+from vecenv.observations import Egocentric, Objects, Rendered
 from vecenv.simpler import snapshot
 from vecenv.simpler.assets import files as assets
 from vecenv.simpler.config import SimplerConfig, SimplerError
@@ -38,7 +38,7 @@ from vecenv.simpler.physics.spec import instances
 from vecenv.simpler.published.lists import EpisodeSpec, check_placement, counts, place, scene_of
 from vecenv.simpler.published.lists import episodes as published_episodes
 from vecenv.simpler.tasks import find_task, list_tasks
-from vecenv.simpler.variants import varied
+from vecenv.simpler.variants import make_variant, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
 
@@ -92,7 +92,7 @@ class SimplerEnv(SlotBatch):
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
-    def _chosen(self, tasks: Any, episodes: Any) -> placing.Placement:
+    def _chosen(self, tasks: object, episodes: object) -> placing.Placement:
         most = max(counts(self.config.protocol, self.suite).values())
         limits = {"num_tasks": len(self.tasks), "num_episodes": most}
         placement = placing.each(task_indices(self.suite, tasks), episodes, self._placement, **limits)
@@ -114,7 +114,7 @@ class SimplerEnv(SlotBatch):
     def _episode(self, task: int, episode: int) -> Episode:
         key = (task, episode)
         if key not in self._prepared:
-            chosen, layout = varied(*scene_of(self._spec(*key)), self.config.variant)
+            chosen, layout = varied(*scene_of(self._spec(*key)), make_variant(self.config.variant))
             made = prepare(chosen, layout, self._root)
             if self.config.variant is not None:
                 require_drawable(made, self._root)
@@ -250,7 +250,7 @@ class SimplerEnv(SlotBatch):
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
-    def observe_egocentric(self, slots: Any = None) -> Egocentric:
+    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
         """What every slot's camera sees now, and its joints; images are rendered when they are first read.
 
         Args:
@@ -262,7 +262,7 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         facts = self._facts.copy()
         state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
-        healthy = [slot for slot in self.slot_indices(slots).tolist() if not self._fault[slot]]
+        healthy: list[int] = [slot for slot in self.slot_indices(slots).tolist() if not self._fault[slot]]
         images = LazyImages(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
         cameras = [episode.task.camera for episode in self._episodes]
         return SimplerEgocentric(
@@ -288,7 +288,7 @@ class SimplerEnv(SlotBatch):
     def _images_s(self) -> float:
         return self._drawing_s
 
-    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
+    def observe_objects(self, points: str = "surface", slots: npt.ArrayLike | None = None) -> Objects:
         """Ground truth of every slot.
 
         Args:
@@ -313,7 +313,7 @@ class SimplerEnv(SlotBatch):
 
     @property
     def stand_ins(self) -> tuple[tuple[str, ...], ...]:
-        """For each slot, notes about missing files and what stands in for them."""
+        """For each slot, notes about missing files and their stand-ins."""
         return tuple(episode.notes for episode in self._episodes)
 
     # -- physics state -------------------------------------------------------------------------------------------------
@@ -386,7 +386,7 @@ class SimplerEnv(SlotBatch):
         return np.concatenate([qpos[:dof], qvel[:dof], qpos[dof:joints], qvel[dof:joints], things.ravel()])
 
 
-def task_indices(suite: str, tasks: Any) -> Any:
+def task_indices(suite: str, tasks: object) -> object:
     """Indices of tasks given by name, index, or several of either; None stays None."""
     if tasks is None or isinstance(tasks, Mapping):
         return tasks

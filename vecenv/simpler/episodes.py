@@ -1,7 +1,7 @@
 """From an episode's layout to what physics needs: the scene, the start, and the objects' roles.
 
 In: a ``Layout`` (``layouts.py``) and the asset tree. Out: ``Episode``: a ``SceneSpec`` that equal episodes share, a
-``Start``, the ``Roles`` that judging needs, and a note for every file that a plain shape stands in for.
+``Start``, the ``Roles`` that judging needs, and a note for every file that is replaced by a plain shape.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Episode:
     Attributes:
         task: its task. layout: where everything is.
         spec: the scene. start: where it begins. roles: of the objects.
-        notes: what is missing and what stands in for it.
+        notes: missing files and their stand-ins.
         undrawn: missing files that only rendering needs: path in the asset tree, and what it is.
     """
 
@@ -75,7 +75,7 @@ def prepare(task: SimplerTask, layout: Layout, root: Path) -> Episode:
         root: of the asset tree.
 
     Raises:
-        AssetsMissing, ModelDataError: a file that nothing can stand in for.
+        AssetsMissing, ModelDataError: a missing file without a stand-in.
     """
     models = read_models(root / task.models_path) if task.models_path else {}
     notes: list[str] = []
@@ -169,7 +169,7 @@ def _stage(task: SimplerTask, root: Path, notes: list[str]) -> StageBody | None:
 
 
 def drawn_stage(episode: Episode, root: Path) -> StageBody | None:
-    """The surroundings as they are drawn: rooms around cabinets can be seen but not touched."""
+    """The surroundings as they are drawn: rooms around cabinets are rendered but have no collision shapes."""
     stage = episode.task.stage
     if stage.solid or stage.mesh is None:
         return episode.spec.stage
@@ -177,7 +177,7 @@ def drawn_stage(episode: Episode, root: Path) -> StageBody | None:
 
 
 def _undrawn(task: SimplerTask, root: Path) -> tuple[str, ...]:
-    """A room's mesh and those of a cabinet's links, where the tree lacks them."""
+    """A room's mesh and those of a cabinet's links that are missing from the tree."""
     wanted = {}
     if task.station is not None:
         wanted = dict.fromkeys(station_meshes(task.station, root), f"a part of {task.station.name}")

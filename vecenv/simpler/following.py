@@ -1,4 +1,4 @@
-"""Following a plan of waypoints: every slot is at its own waypoint and advances when it has arrived.
+"""Following a plan of waypoints: every slot advances to its next waypoint when it has reached the current one.
 
 In: a checked plan and, tick by tick, the facts of all slots. Out: the rewards, which waypoints were reached, and how
 many ticks each one took.
@@ -47,7 +47,7 @@ class PlanFollower:
 
         Args:
             tick: one control tick, from actions [B, 7] and active slots (bool [B]) to rewards [B].
-            facts: the present rows of ``physics.spec.facts_dtype``, [B].
+            facts: the current rows of ``physics.spec.facts_dtype``, [B].
             done: which slots have finished, bool [B].
 
         Returns:
@@ -70,7 +70,7 @@ class PlanFollower:
     def _advance(
         self, going: np.ndarray, here: np.ndarray, targets: np.ndarray, driving: np.ndarray, tool: np.ndarray
     ) -> None:
-        """Slots that arrived, are stuck or have spent the waypoint's ticks go on to their next waypoint."""
+        """Advance slots that reached their waypoint, are stuck, or have spent its ticks."""
         rows = self._rows
         arrived = self._servo.arrived(targets, tool)
         limit = np.where(driving, self._servo.config.max_steps, self._hold[rows, here])

@@ -89,7 +89,7 @@ class Placed:
 
     Attributes:
         model: its name, also of its folder in the asset tree.
-        role: ``source`` (the object to move), ``target``, ``other``, ``distractor`` (likewise, but dropped when the
+        role: ``source`` (the object to move), ``target``, ``other``, ``distractor`` (another object, dropped when the
             rest has settled), or ``fixture`` (does not move).
         position: metres, world frame; where it is dropped, or stands.
         quat: wxyz, world frame.
@@ -122,7 +122,7 @@ class Layout:
         instruction: the policy's instruction at first.
         second_instruction: its instruction in the second half of a ``place`` episode, else "".
         orientation: of ``pick``, how the object lies.
-        episode_id: upstream's number of the arrangement, None where it has none.
+        episode_id: upstream's number of the arrangement, None if there is none.
     """
 
     task: str

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from vecenv.contract import CameraView, Egocentric
+from vecenv.observations import CameraView, Egocentric
 from vecenv.simpler.control.chain import Chain
 from vecenv.simpler.control.robots import Robot
 from vecenv.simpler.control.rotations import quat_from_rotation, rotation_from_quat

@@ -1,4 +1,4 @@
-"""Ground truth of a SIMPLER slot, as planners read it: ``ObjectsSnapshot`` from an episode and its facts.
+"""Ground truth of a SIMPLER slot for planners: ``ObjectsSnapshot`` from an episode and its facts.
 
 In: an ``Episode`` and a row of ``physics.spec.facts_dtype``. Out: surface samples of every object's collision mesh and
 of the cabinet's boxes, poses, the drawers as parts with their joints, and the task's goal as a predicate. Samples of a
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
+from vecenv.observations import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from vecenv.simpler.control.rotations import rotation_from_quat
 from vecenv.simpler.episodes import Episode
 from vecenv.simpler.task_spec import BRIDGE, SimplerTask

@@ -1,4 +1,4 @@
-"""Where SIMPLER's robots stand when an episode begins, and the positions of their joints.
+"""Positions and joint positions of SIMPLER's robots when an episode begins.
 
 Lengths are metres, angles radians, quaternions wxyz in the world frame, as tuples. The numbers are upstream's
 (ManiSkill2_real2sim commit ef7a4d4, ``envs/custom_scenes``).
@@ -68,7 +68,7 @@ def stand(station: Station) -> Stand:
 
 
 def put_on_station(task: SimplerTask) -> Station:
-    """Where WidowX stands in a task of ``put_on``."""
+    """Position of WidowX in a task of ``put_on``."""
     return SINK_STATION if at_sink(task) else WIDOWX_STATION
 
 

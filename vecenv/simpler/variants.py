@@ -120,7 +120,7 @@ def make_variant(given: Variant | Mapping[str, str | None] | None) -> Variant | 
     known = [field.name for field in fields(Variant)]
     strange = [name for name in given if name not in known]
     if strange:
-        raise VariantError(f"variant: {strange[0]!r} is none of {', '.join(known)}")
+        raise VariantError(f"variant: {strange[0]!r} is not one of {', '.join(known)}")
     return Variant(**given)
 
 
@@ -133,7 +133,7 @@ def varied(task: SimplerTask, layout: Layout, variant: Variant | None) -> tuple[
     if variant is None or variant == Variant():
         return task, layout
     if task.family not in _GOOGLE_FAMILIES:
-        raise VariantError(f"variant: there are none of {task.name}, upstream varies the Google Robot's scenes only")
+        raise VariantError(f"variant: {task.name} has none, upstream varies the Google Robot's scenes only")
     changed = replace(task, **_task_changes(task, variant))
     return changed, _with_objects(changed, _with_camera(layout, variant), variant)
 

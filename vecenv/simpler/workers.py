@@ -111,7 +111,7 @@ class LocalSlots:
 
     Args:
         sizes: of the arrays.
-        memory: buffer that they lie in; None for memory of their own.
+        memory: buffer that they lie in; None for new memory.
     """
 
     def __init__(self, sizes: Sizes, memory: mmap.mmap | None = None) -> None:

@@ -2,7 +2,7 @@
 
 In: arrays sharded by their first axis, or replicated. Out: arrays sharded likewise. Devices exchange nothing, so a loop
 ends on a device when its own rows have stopped. Every device has its own executable and its own thread: XLA's
-partitioner does not survive Warp's calls (segmentation fault in the compiler; jax 0.11.2, warp-lang 1.18.0), and a
+partitioner crashes on Warp's calls (segmentation fault in the compiler; jax 0.11.2, warp-lang 1.18.0), and a
 thread that waits for a loop's condition on one device must not keep the other devices waiting.
 """
 
@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
@@ -40,14 +41,14 @@ class Spread:
         self._replicated, self._rows = replicated(mesh), over_rows(mesh)
         self._threads = ThreadPoolExecutor(mesh.size, thread_name_prefix="vecenv-device")
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """Call the function; arguments on other devices are copied to the right ones first."""
         put = [jax.device_put(arg, self._replicated) for arg in args[: self._shared]]
         put += [jax.device_put(arg, self._rows) for arg in args[self._shared :]]
         shares = [_share(put, index) for index in range(self._count)]
         return self._join(list(self._threads.map(lambda share: self._function(*share), shares)))
 
-    def _join(self, parts: Sequence[Any]) -> Any:
+    def _join(self, parts: Sequence[PyTree]) -> PyTree:
         """Arrays over all devices from what each device computed; nothing is copied."""
 
         def join(*shares: jax.Array) -> jax.Array:
@@ -57,6 +58,6 @@ class Spread:
         return jax.tree.map(join, *parts)
 
 
-def _share(tree: Any, index: int) -> Any:
+def _share(tree: PyTree, index: int) -> PyTree:
     """The part of sharded arrays that one device holds."""
     return jax.tree.map(lambda array: array.addressable_shards[index].data, tree)

@@ -6,11 +6,12 @@ context. Out: a function of one world for any nesting of ``vmap``, which prepare
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 
 class Sized:
@@ -24,31 +25,31 @@ class Sized:
     def __init__(self, function: Callable[..., Any], prepare: Callable[[int], Any]) -> None:
         self._function, self._prepare = function, prepare
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: PyTree) -> PyTree:
         """The function of one world, or under ``vmap`` of many."""
 
         @jax.custom_batching.custom_vmap
-        def one(*args: Any) -> Any:
+        def one(*args: PyTree) -> PyTree:
             return self._function(self._prepare(1), *args)
 
         @one.def_vmap
-        def _(size: int, batched: Any, *args: Any) -> Any:
+        def _(size: int, batched: Sequence[PyTree], *args: PyTree) -> PyTree:
             return _all_batched(self._many(size, _axes(batched))(*args))
 
         return one(*args)
 
-    def _many(self, size: int, axes: Any) -> Callable[..., Any]:
+    def _many(self, size: int, axes: tuple[PyTree, ...]) -> Callable[..., Any]:
         """The function of ``size`` worlds on leading axes; those of further ``vmap``s are folded into them."""
 
         @jax.custom_batching.custom_vmap
-        def many(*args: Any) -> Any:
-            def one(*args: Any) -> Any:
+        def many(*args: PyTree) -> PyTree:
+            def one(*args: PyTree) -> PyTree:
                 return self._function(self._prepare(size), *args)
 
             return jax.vmap(one, in_axes=axes, axis_size=size)(*args)
 
         @many.def_vmap
-        def _(outer: int, batched: Any, *args: Any) -> Any:
+        def _(outer: int, batched: Sequence[PyTree], *args: PyTree) -> PyTree:
             folded = jax.tree.map(
                 lambda x, inner, now: _fold(x, inner is not None, now, outer, size),
                 args,
@@ -68,15 +69,15 @@ class Sized:
         return many
 
 
-def _axes(batched: Any) -> Any:
+def _axes(batched: Sequence[PyTree]) -> tuple[PyTree, ...]:
     return jax.tree.map(lambda mapped: 0 if mapped else None, tuple(batched))
 
 
-def _all_batched(out: Any) -> tuple[Any, Any]:
+def _all_batched(out: PyTree) -> tuple[PyTree, PyTree]:
     return out, jax.tree.map(lambda _: True, out)
 
 
-def _fold(x: Any, inner: bool, outer: bool, outer_size: int, inner_size: int) -> Any:
+def _fold(x: jax.Array, inner: bool, outer: bool, outer_size: int, inner_size: int) -> jax.Array:
     """Merge leading axes of ``outer_size`` and ``inner_size`` into one; an axis that is missing is broadcast."""
     if not inner and not outer:
         return x

@@ -20,17 +20,27 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from types import MappingProxyType, ModuleType
+from typing import TYPE_CHECKING, Any, Protocol
 
 from voxposer.language import providers
 from voxposer.language.replies import LlmError, Message, Reply, ReplyError, Usage
 from voxposer.language.reply_cache import cache_at
 from voxposer.offline.provider import register
 
+if TYPE_CHECKING:
+    from tenacity import RetryCallState
+
 OFFLINE = "offline/"
 # Layout of requests and replies on disk; raised when it changes.
 FORMAT = 1
+
+
+class Response(Protocol):
+    """The part of litellm's response that is read; each choice has a ``message`` and a ``finish_reason``."""
+
+    choices: Sequence[Any]
+    model: str | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +126,7 @@ class Llm:
         if kept is not None:
             self._count(Usage(cached=1))
             return kept
-        reply = self._asked(request)
+        reply = self._with_retries(request)
         if check is not None:
             check(reply.text)
         self._keep(key, request, reply)
@@ -168,7 +178,7 @@ class Llm:
 
     # The question
 
-    def _asked(self, request: Mapping[str, Any]) -> Reply:
+    def _with_retries(self, request: Mapping[str, Any]) -> Reply:
         response = self._answered(request)
         reply = self._reply(response, request["stop"])
         self._count(
@@ -215,7 +225,7 @@ class Llm:
             return False
         return bool(providers.litellm().validate_environment(self.config.model)["missing_keys"])
 
-    def _attempt(self, litellm: Any, request: Mapping[str, Any]) -> Any:
+    def _attempt(self, litellm: ModuleType, request: Mapping[str, Any]) -> Any:
         if self._is_offline():
             register()
         return litellm.completion(
@@ -231,11 +241,11 @@ class Llm:
             api_key=self.config.api_key,
         )
 
-    def _pause(self, state: Any, pauses: Callable[[Any], float]) -> float:
-        asked = providers.retry_after(state.outcome.exception())
+    def _pause(self, state: RetryCallState, pauses: Callable[[RetryCallState], float]) -> float:
+        asked = providers.retry_after(state.outcome.exception() if state.outcome else None)
         return pauses(state) if asked is None else min(asked, self.config.backoff_max_s)
 
-    def _reply(self, response: Any, stop: Sequence[str]) -> Reply:
+    def _reply(self, response: Response, stop: Sequence[str]) -> Reply:
         choices = getattr(response, "choices", None)
         if not choices:
             raise ReplyError(self.config.model, "the response has no answer in it")

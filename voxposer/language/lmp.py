@@ -9,14 +9,14 @@ answer in ``voxposer.sandbox``:
 
 - the *planner* splits an instruction into calls of ``composer``, one for each subtask;
 - the *composer* answers a subtask by calling the others and then ``execute``, once or several times;
-- *parse_query_obj* finds what words refer to. The program is kept, not its result: each look at the observation runs it
-  again, so it is always the present one;
+- *parse_query_obj* finds what words refer to. The program is kept, not its result: reading the observation runs it
+  again, so that it is always up to date;
 - *get_affordance_map*, *get_avoidance_map*, *get_rotation_map*, *get_velocity_map*, *get_gripper_map* write maps over
   the voxel grid, kept as programs too and run when ``execute`` asks for them.
 
 The semantics are upstream's (huangwl18/VoxPoser, ``src/LMP.py``, ``src/interfaces.py``, ``rlbench_config.yaml``), its
-prompt files included: stop tokens, the context line, query prefix and suffix, ``ret_val``. What upstream leaves open is
-closed: programs are checked and bounded, a query is one line, and each LMP gets only the functions it is for.
+prompt files included: stop tokens, the context line, query prefix and suffix, ``ret_val``. Beyond
+upstream, programs are checked and bounded, a query is one line, and each LMP gets only the functions it needs.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Lmps:
         return {"composer": self.composer} | makers
 
     def set_context(self, objects: Sequence[str]) -> None:
-        """Say which objects there are; the planner and ``parse_query_obj`` are told.
+        """Set the names of the scene's objects, which the planner and ``parse_query_obj`` receive.
 
         Raises:
             TypeError: they are not a list of names.
@@ -112,7 +112,7 @@ class Lmps:
     # The eight LMPs
 
     def planner(self, query: str) -> None:
-        """Do what an instruction says: plan it, and run the composer on each subtask.
+        """Carry out an instruction: plan it, and run the composer on each subtask.
 
         Raises:
             LmpError: a program, this one's or one it called, cannot be run.
@@ -121,11 +121,11 @@ class Lmps:
         self._execute(self._write("planner", query), self._functions)
 
     def composer(self, query: str) -> None:
-        """Do one subtask: run the program that calls ``execute``. Raises as ``planner``."""
+        """Carry out one subtask: run the program that calls ``execute``. Raises as ``planner``."""
         self._execute(self._write("composer", query), self._functions)
 
     def parse_query_obj(self, query: str) -> DynamicObservation | DynamicObservations:
-        """What words refer to: one thing, or several where the program returns a list.
+        """The object that a query refers to, or several where the program returns a list.
 
         Raises:
             LmpError: the program cannot be run, or found nothing.
@@ -136,27 +136,27 @@ class Lmps:
         return DynamicObservation(lambda: self._one(written))
 
     def get_affordance_map(self, query: str) -> LazyMap:
-        """Where to go: 1 at targets, 0 elsewhere."""
+        """Targets of a motion: 1 at targets, 0 elsewhere."""
         return self._map("get_affordance_map", query)
 
     def get_avoidance_map(self, query: str) -> LazyMap:
-        """Where not to go: 0 to 1."""
+        """Cost of passing through each voxel, 0 to 1."""
         return self._map("get_avoidance_map", query)
 
     def get_rotation_map(self, query: str) -> LazyMap:
-        """How the hand is turned at each place: quaternions wxyz, world frame."""
+        """Orientation of the hand at each voxel: quaternions wxyz, world frame."""
         return self._map("get_rotation_map", query)
 
     def get_velocity_map(self, query: str) -> LazyMap:
-        """How fast the hand moves at each place: 1 is normal."""
+        """Speed of the hand at each voxel: 1 is normal."""
         return self._map("get_velocity_map", query)
 
     def get_gripper_map(self, query: str) -> LazyMap:
-        """Whether the gripper is open at each place: 1 open, 0 closed."""
+        """Whether the gripper is open at each voxel: 1 open, 0 closed."""
         return self._map("get_gripper_map", query)
 
     def plan(self, query: str) -> tuple[str, ...]:
-        """The subtasks an instruction is split into, in order; nothing is done. Raises as ``planner``."""
+        """The subtasks of an instruction, in order; nothing is executed. Raises as ``planner``."""
         subtasks: list[str] = []
         written = self._write("planner", query)
         self._execute(written, self._functions | {"composer": _recorder(subtasks)})
@@ -169,7 +169,7 @@ class Lmps:
         return LazyMap(name, written.query, lambda: self._voxels(written))
 
     def _voxels(self, written: _Written) -> np.ndarray:
-        """The map a program makes, checked to be one."""
+        """The map that a program returns, checked."""
         value = self._execute(written, self._functions)
         tail = (4,) if written.config.name == "get_rotation_map" else ()
         shape = np.shape(value) if isinstance(value, np.ndarray) else (0,)
@@ -203,8 +203,8 @@ class Lmps:
 
     # Writing programs
 
-    def _write(self, name: str, query: Any) -> _Written:
-        """The program for a query, asked of the model."""
+    def _write(self, name: str, query: object) -> _Written:
+        """Request the program for a query from the model."""
         config, words = self._configs[name], self._words(name, query)
         context = self._context(config, words)
         call = Call(lmp=name, query=words, context=context, model=self._llm.config.model)
@@ -212,13 +212,13 @@ class Lmps:
             self._budget.program()
         self.trace.append(call)
         with self._inside(call), self._clock_stopped():
-            reply = self._asked(config, call)
+            reply = self._reply(config, call)
             call.cached, call.cost_usd = reply.cached, reply.cost_usd
             call.prompt_tokens, call.completion_tokens = reply.prompt_tokens, reply.completion_tokens
             return _Written(config=config, query=words, program=self._parsed(call, reply.text), call=call)
 
-    def _words(self, name: str, query: Any) -> str:
-        """A query as one line without the suffix."""
+    def _words(self, name: str, query: object) -> str:
+        """A query as one line, without the full stop at its end."""
         if not isinstance(query, str):
             raise LmpError(name, str(query)[:80], "query", f"a query is text, not {type(query).__name__}")
         words = " ".join(query.split()).rstrip(". ")
@@ -233,7 +233,7 @@ class Lmps:
             raise LmpError(config.name, query, "query", "no objects are known; call set_context first")
         return f"objects = {list(self._objects)}"
 
-    def _asked(self, config: LmpConfig, call: Call) -> Reply:
+    def _reply(self, config: LmpConfig, call: Call) -> Reply:
         try:
             return self._llm.complete(
                 self._messages(config, call),
@@ -245,7 +245,7 @@ class Lmps:
         except ReplyError as error:
             raise LmpError(call.lmp, call.query, "reply", str(error)) from error
         except LlmError as error:
-            error.add_note(f"asked by {call.lmp}({call.query!r})")
+            error.add_note(f"requested by {call.lmp}({call.query!r})")
             raise
 
     def _messages(self, config: LmpConfig, call: Call) -> list[Message]:
@@ -264,13 +264,13 @@ class Lmps:
         try:
             return _parse(call.code, self._limits)
         except SandboxError as error:
-            reason = f"{call.model} wrote what cannot be run: {error.reason}, in {_start(call.code)}"
+            reason = f"{call.model} wrote a program that cannot be run: {error.reason}, in {_start(call.code)}"
             raise LmpError(call.lmp, call.query, error.rule, reason, error.line) from error
 
     # Running programs
 
     def _execute(self, written: _Written, functions: Mapping[str, Callable[..., Any]]) -> Any:
-        """Run a program; what goes wrong in it is told as this LMP's."""
+        """Run a program; its errors are reported as errors of this LMP."""
         config = written.config
         variables = dict(self._session_variables.get(config.name, {}))
         if config.include_context:
@@ -292,7 +292,7 @@ class Lmps:
 
     @contextlib.contextmanager
     def _running(self, written: _Written) -> Iterator[Budget]:
-        """The budget a program draws on: that of the program it runs for; a composer's always has its own."""
+        """The budget of a program: its caller's, except that each composer program gets a new one."""
         outer = self._budget
         if outer is None or written.config.name == "composer":
             self._budget = Budget(self._limits)
@@ -311,13 +311,13 @@ class Lmps:
 
     @contextlib.contextmanager
     def _clock_stopped(self) -> Iterator[None]:
-        """The model's time is not the program's."""
+        """Stop the program's clock while the model answers."""
         with self._budget.clock(running=False) if self._budget else contextlib.nullcontext():
             yield
 
     @contextlib.contextmanager
     def _inside(self, call: Call) -> Iterator[None]:
-        """Write what goes wrong into the trace."""
+        """Record an error in the trace."""
         try:
             yield
         except Exception as error:
@@ -356,14 +356,14 @@ def build_lmps(
 
 @functools.lru_cache(maxsize=4096)
 def _parse(code: str, limits: Limits) -> Program:
-    """A program; batches of episodes are answered with the same few over and over."""
+    """A parsed program, cached: the episodes of a batch share the same few."""
     return sandbox.parse(code, limits=limits)
 
 
 def _recorder(subtasks: list[str]) -> Callable[[Any], None]:
-    """A composer that only writes down what it is asked."""
+    """A composer that only records its queries."""
 
-    def composer(query: Any) -> None:
+    def composer(query: object) -> None:
         if not isinstance(query, str):
             raise TypeError(f"a subtask is text, not {type(query).__name__}")
         if len(subtasks) == _SUBTASKS:
@@ -373,14 +373,14 @@ def _recorder(subtasks: list[str]) -> Callable[[Any], None]:
     return composer
 
 
-def _static(value: Any) -> Observation | None:
-    """An observation as it is now; None for what is none."""
+def _static(value: object) -> Observation | None:
+    """The present value of an observation; None if the value is not one."""
     if isinstance(value, DynamicObservation):
         return value()
     return value if isinstance(value, Observation) else None
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"an array {list(value.shape)}"
     return "nothing" if value is None else f"{type(value).__name__} {str(value)[:80]!r}"

@@ -16,7 +16,7 @@ from voxposer.sandbox.guard import Opaque, Record, RecordList
 
 
 class Observation(Record, Mapping[str, Any]):
-    """What is known of a thing at one moment: fields such as ``position``, ``aabb`` and ``normal``.
+    """Observation of an object at one moment: fields such as ``position``, ``aabb`` and ``normal``.
 
     Reading a field gives a copy of an array, list or dictionary. Fields whose names start with an underscore are for
     the host alone. Observations are compared by identity.
@@ -56,13 +56,13 @@ class Observation(Record, Mapping[str, Any]):
 
 
 class DynamicObservation(Record):
-    """A thing as it is whenever it is looked at: each read runs the program that finds it again."""
+    """An object whose fields are always current: each read runs the program that finds it again."""
 
     def __init__(self, now: Callable[[], Observation]) -> None:
         self._now = now
 
     def __call__(self) -> Observation:
-        """The thing as it is now."""
+        """The present observation."""
         return self._now()
 
     def fields(self) -> Collection[str]:
@@ -82,13 +82,13 @@ class DynamicObservation(Record):
 
 
 class DynamicObservations(RecordList):
-    """Several things as they are whenever they are looked at."""
+    """Several objects whose fields are always current."""
 
     def __init__(self, now: Callable[[], Sequence[Observation]]) -> None:
         self._now = now
 
     def __call__(self) -> list[Observation]:
-        """The things as they are now."""
+        """The present observations."""
         return list(self._now())
 
     def __len__(self) -> int:

@@ -33,7 +33,7 @@ _CLASSES = re.compile(r"^(litellm\.)?(\w+Error: |Timeout: |Timeout Error: )*(\w+
 
 @functools.cache
 def litellm() -> Any:
-    """litellm, told to leave the network, ``.env`` files and the terminal alone.
+    """litellm, configured not to use the network, ``.env`` files or the terminal.
 
     Raises:
         MissingDependency: it is not installed.
@@ -75,7 +75,7 @@ def _environment(**values: str) -> Iterator[None]:
             os.environ.pop(name, None)
 
 
-def price(response: Any, model: str) -> float | None:
+def price(response: object, model: str) -> float | None:
     """Price of a response in US dollars; None if litellm does not know the model's price."""
     try:
         return float(litellm().completion_cost(completion_response=response, model=model))

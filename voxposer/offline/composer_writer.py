@@ -10,7 +10,7 @@ import re
 
 from voxposer.offline.rules import BESIDE, CM, SIDES, THING, Groups, Rules, choose, get
 
-# Room left before and after a push, centimetres; a pushed thing is let go of while it slides.
+# Room left before and after a push, centimetres; a pushed part is released while it slides.
 PUSH_ROOM, PUSH_RUN = 5, 8
 # Degrees that a knob is turned to switch on, and to switch off, where its stop ends the motion.
 SWITCH_ON, SWITCH_OFF = 90, -120

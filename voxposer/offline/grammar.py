@@ -37,8 +37,8 @@ class Noun:
         words: content words, singular, the noun itself last; what it is a part of comes first.
         side: which of several equal objects: left, right, front, back, middle, top or bottom.
         relation: to other objects.
-        plural: it was said in the plural, or with "both" or "all".
-        indefinite: it was said with "a" or "any": one is as good as another.
+        plural: the phrase is in the plural, or has "both" or "all".
+        indefinite: the phrase has "a" or "any": every matching object will do.
     """
 
     words: tuple[str, ...]
@@ -53,15 +53,16 @@ class Noun:
         return self.words in {("it",), ("them",), ("one",)}
 
     def __str__(self) -> str:
-        """The phrase in words that this grammar reads back as the same noun."""
+        """The phrase in words, which this grammar parses to the same noun."""
         article = "any" if self.indefinite else "the"
         side = f" {_SIDE_WORDS[self.side]}" if self.side else ""
-        return f"{article} {' '.join(self.words)}{side}" + (f" {_say(self.relation)}" if self.relation else "")
+        relation = f" {_relation_text(self.relation)}" if self.relation else ""
+        return f"{article} {' '.join(self.words)}{side}{relation}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where something goes: ``relation`` on, in, top_of, under, near, left_of, right_of, front_of, back_of a thing."""
+    """A destination: ``relation`` on, in, top_of, under, near, left_of, right_of, front_of, back_of an object."""
 
     relation: str
     thing: Noun
@@ -69,7 +70,7 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Action:
-    """One thing to do: ``verb`` is pick, put, push, open, close, turn_on or turn_off."""
+    """One action: ``verb`` is pick, put, push, open, close, turn_on or turn_off."""
 
     verb: str
     thing: Noun
@@ -98,7 +99,7 @@ _SIDE = r"(left|right|front|back|rear|middle|center|centre|top|bottom)"
 _SAME_SIDE = {"rear": "back", "center": "middle", "centre": "middle", "upper": "top", "lower": "bottom"}
 _ENDS = r"(?=\s+(?:and|then|on|onto|in|into|at|to|next|near|beside|between|from|under|inside|behind|not)\b|\s*,|\s*$)"
 
-# Spellings brought to one form before anything is read: pattern, replacement.
+# Normalisation of spelling before parsing: pattern, replacement.
 _SPELLINGS = (
     (r"[\u2018\u2019\u02bc]", "'"),
     (r"-", " "),
@@ -145,13 +146,13 @@ _VERBS = (
 )
 _ANY_VERB = "|".join(pattern for _, pattern in _VERBS)
 _CLAUSES = re.compile(rf"(?:\s*,\s*|\s+)(?:and then|then|and)\s+(?=(?:{_ANY_VERB})\b)|\s*[,;]\s*(?=(?:{_ANY_VERB})\b)")
-# "turn the stove on" said as "turn_on the stove".
+# "turn the stove on" becomes "turn_on the stove".
 _SPLIT_VERB = re.compile(r"\b(?:turn|switch) ((?:the )?\w+(?: \w+)?) (on|off)\b(?=\s+(?:and|then)\b|\s*,|\s*$)")
 _DETERMINERS = frozenset(["the", "a", "an", "any", "both", "all", "two", "that", "this", "some"])
 
 
 def read_instruction(text: str) -> tuple[Action, ...]:
-    """The actions an instruction asks for, in order.
+    """The actions of an instruction, in order.
 
     Raises:
         NotUnderstood: a clause without a known verb, or with words left over.
@@ -160,23 +161,23 @@ def read_instruction(text: str) -> tuple[Action, ...]:
 
 
 def read_noun(text: str) -> Noun:
-    """A noun phrase with everything that qualifies it: "the black bowl between the plate and the ramekin"."""
+    """A noun phrase with its qualifiers: "the black bowl between the plate and the ramekin"."""
     tokens = _Tokens(_tokens(spell(text)))
     noun, phrases = tokens.group()
     if noun is None or not tokens.at_end:
-        raise NotUnderstood(f"{text!r} is not read as the description of a thing")
+        raise NotUnderstood(f"{text!r} cannot be parsed as a description of an object")
     return _qualified(noun, phrases)
 
 
 def spell(text: str) -> str:
-    """An instruction in lower case with spellings, possessives and colour pairs brought to one form."""
+    """An instruction in lower case, with spellings, possessives and colour pairs normalised."""
     text = text.lower()
     for pattern, replacement in _SPELLINGS:
         text = re.sub(pattern, replacement, text)
     return _SPLIT_VERB.sub(r"turn_\2 \1", " ".join(text.split()))
 
 
-def _say(relation: Relation | None) -> str:
+def _relation_text(relation: Relation | None) -> str:
     if relation is None:
         return ""
     refs = " and ".join(map(str, relation.refs))
@@ -194,12 +195,12 @@ def _clause(text: str) -> tuple[str, list[str]]:
         found = re.match(rf"(?:{pattern})\b", text)
         if found:
             return verb, _tokens(text[found.end() :])
-    raise NotUnderstood(f"no verb that is known at the beginning of {text!r}")
+    raise NotUnderstood(f"no known verb at the beginning of {text!r}")
 
 
 @dataclass(frozen=True)
 class _Phrase:
-    """A prepositional phrase; without a thing where it was left unsaid."""
+    """A prepositional phrase; ``thing`` is None where the object is implied."""
 
     kind: str
     thing: Noun | None = None
@@ -221,29 +222,29 @@ class _Tokens:
         return "" if self.at_end else self._tokens[self._at]
 
     def take(self, token: str) -> bool:
-        """Step over a token if it comes next."""
+        """Skip the next token if it is this one."""
         found = self._next() == token
         self._at += found
         return found
 
     def groups(self) -> list[tuple[Noun | None, list[_Phrase]]]:
-        """Noun phrases joined by "and", each with the prepositional phrases behind it."""
+        """Noun phrases joined by "and", each with the prepositional phrases after it."""
         found = [self.group()]
         while self.take("AND"):
             found.append(self.group())
         if not self.at_end:
-            raise NotUnderstood(f"{' '.join(self._tokens[self._at :])!r} is left over")
+            raise NotUnderstood(f"{' '.join(self._tokens[self._at :])!r} is not understood")
         return found
 
     def group(self) -> tuple[Noun | None, list[_Phrase]]:
-        """A noun phrase and the prepositional phrases behind it."""
+        """A noun phrase and the prepositional phrases after it."""
         noun, phrases = self.noun(), []
         while self._next() and self._next() not in {"AND", "OF"} and not self._next().islower():
             phrases.append(self._phrase())
         return noun, phrases
 
     def noun(self) -> Noun | None:
-        """Determiner, words and "of ..."; None where no words come."""
+        """Parse determiner, words and "of ..."; None if there are no words."""
         determiners, words = self._words(_DETERMINERS), self._words(None)
         while self.take("OF"):
             self._words(_DETERMINERS)
@@ -282,7 +283,7 @@ class _Tokens:
         thing = self.noun()
         second = self.noun() if kind == "between" and self.take("AND") else None
         if kind == "between" and second is None and not (thing and thing.plural):
-            raise NotUnderstood("'between' needs two things")
+            raise NotUnderstood("'between' needs two objects")
         return _Phrase(kind, thing, second, negated)
 
 
@@ -291,19 +292,19 @@ _MODIFIERS = frozenset(["from", "outside", "center", "between"])
 
 
 def _qualified(noun: Noun, phrases: Sequence[_Phrase]) -> Noun:
-    """A noun with its prepositional phrases as its relation."""
+    """A noun with its prepositional phrases nested as its relation."""
     if not phrases:
         return noun
     first, *rest = phrases
     if first.thing is None:
-        raise NotUnderstood(f"'{first.kind}' what?")
+        raise NotUnderstood(f"'{first.kind}' has no object")
     thing = _qualified(first.thing, rest)
     refs = (thing,) if first.second is None else (first.thing, _qualified(first.second, rest))
     return replace(noun, relation=Relation(kind=first.kind, refs=refs, negated=first.negated))
 
 
 class _Reader:
-    """Turns clauses into actions, remembering what pronouns and gaps can point to."""
+    """Turns clauses into actions; keeps the objects that pronouns and omitted objects can refer to."""
 
     def __init__(self) -> None:
         self._picked: list[Noun] = []
@@ -326,7 +327,7 @@ class _Reader:
         return tuple(self.actions)
 
     def _leave_picked(self) -> None:
-        """Things picked up and not put anywhere stay in the hand."""
+        """Objects picked up and not put anywhere stay in the hand."""
         self.actions += [Action(verb="pick", thing=noun) for noun in self._picked]
         self._picked = []
 
@@ -334,7 +335,7 @@ class _Reader:
         if noun is not None and not noun.is_pronoun:
             return noun
         if self._fixture is None:
-            raise NotUnderstood(f"{'it' if noun else 'what'} points back to nothing")
+            raise NotUnderstood(f"{'the pronoun' if noun else 'the omitted object'} refers to nothing")
         return self._fixture
 
     def _operate(self, verb: str, groups: Sequence[tuple[Noun | None, list[_Phrase]]]) -> None:
@@ -352,30 +353,30 @@ class _Reader:
         self._add([self._completed(action, placed, index) for index, action in enumerate(placed)], verb)
 
     def _moving(self, noun: Noun | None) -> list[Noun]:
-        """What is to be put: what was said, or what was picked up, or what was put somewhere before."""
+        """The objects to put: the noun's, else those picked up, else those put somewhere before."""
         if noun is not None and not noun.is_pronoun:
             return [noun]
         moving = self._picked or self._moved
         if not moving:
-            raise NotUnderstood("what is to be put there is not said")
+            raise NotUnderstood("the object to put there is missing")
         self._picked = []
         return moving
 
     def _place(self, phrases: Sequence[_Phrase], later: Sequence[Action]) -> Place | None:
-        """The last phrase, or where the next thing goes ("put A and B in the basket")."""
+        """The last phrase, or the destination of the next object ("put A and B in the basket")."""
         if not phrases:
             return later[0].place if later else None
         last = phrases[-1]
         if last.kind not in _PLACES or last.negated:
-            raise NotUnderstood(f"'{last.kind}' does not say where to put something")
-        gap = Noun(words=("it",))
-        return Place(relation=last.kind, thing=last.thing or gap)
+            raise NotUnderstood(f"'{last.kind}' is not a destination")
+        omitted = Noun(words=("it",))
+        return Place(relation=last.kind, thing=last.thing or omitted)
 
     def _completed(self, action: Action, placed: Sequence[Action], index: int) -> Action:
-        """The action with a pronoun or gap in its place filled in."""
+        """The action with a pronoun or omitted object in its destination resolved."""
         place = action.place
         if place is None:
-            raise NotUnderstood(f"where to put {action.thing} is not said")
+            raise NotUnderstood(f"the destination of {action.thing} is missing")
         if not place.thing.is_pronoun:
             return action
         before = placed[index - 1].place if index else None
@@ -397,8 +398,8 @@ class _Reader:
         return [replace(carry, thing=stack.place.thing), stack]
 
 
-def side_said(words: Sequence[str]) -> tuple[tuple[str, ...], str | None]:
-    """Words without the one that orders alike things, and that word: ("middle", "bowl") -> ("bowl",), "middle"."""
+def split_side(words: Sequence[str]) -> tuple[tuple[str, ...], str | None]:
+    """Words without the one that selects among equals, and that word: ("middle", "bowl") -> ("bowl",), "middle"."""
     for word in words:
         if word in SIDES and len(words) > 1:
             return tuple(other for other in words if other != word), _SAME_SIDE.get(word, word)

@@ -59,7 +59,7 @@ def _along(match: Groups) -> list[str]:
 
 
 def _beside_for(match: Groups) -> list[str]:
-    """Next to a thing, with room for another: the other's middle if it is pushed, the hand over it if it is held."""
+    """Next to an object, with room for another: the other's middle if it is pushed, the hand over it if it is held."""
     held = match["moved"] == "the held object"
     other = "held" if held else "moved"
     lines = [
@@ -83,7 +83,7 @@ def _beside_for(match: Groups) -> list[str]:
 
 
 def _spot(side: str, room: str, other: str) -> list[str]:
-    """x and y of the middle of a thing of size ``size_x``, ``size_y`` that stands next to ``beside``."""
+    """x and y of the middle of an object of size ``size_x``, ``size_y`` that stands next to ``beside``."""
     if side in {"next to", "towards"}:
         return [
             "# on the side where it is now",
@@ -102,7 +102,7 @@ def _spot(side: str, room: str, other: str) -> list[str]:
 
 
 def _offset_point(match: Groups) -> list[str]:
-    """Some way to one side, and perhaps another, of a thing's bounds or of a voxel."""
+    """At a distance to one side, or two sides, of an object's bounds or of a voxel."""
     shifts = [(match["cm"], match["side"].lower())]
     shifts += [(match["cm2"], match["side2"].lower())] if match["cm2"] else []
     voxel = re.fullmatch(r"\[? *(\d+)[ ,]+(\d+)[ ,]+(\d+) *\]?", match["thing"])

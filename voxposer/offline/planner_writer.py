@@ -11,10 +11,10 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from voxposer.offline.grammar import Action, Noun, Place, Relation, read_instruction, read_noun, side_said
+from voxposer.offline.grammar import Action, Noun, Place, Relation, read_instruction, read_noun, split_side
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 
-# Distances spoken of in subtasks, centimetres: over a target before the last descent; before a target that is entered
+# Distances named in subtasks, centimetres: over a target before the last descent; before a target that is entered
 # from a side; after grasping and releasing; the way of a drawer, which stops at its end by itself; a step of a door;
 # room kept from what is to be avoided.
 ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID = 10, 20, 10, 18, 22, 10, 15
@@ -52,7 +52,7 @@ def ground(noun: Noun, names: Sequence[Name]) -> Found:
     Raises:
         NotUnderstood: no name fits, or several do and the noun does not say which.
     """
-    words, side = side_said(noun.words)
+    words, side = split_side(noun.words)
     for option in (noun, replace(noun, words=words, side=side) if side and not noun.side else noun):
         found = matching(option.words, names)
         if found:
@@ -79,7 +79,7 @@ def write_planner(instruction: str, objects: Sequence[str]) -> str:
 
 
 def _extras(instruction: str, names: Sequence[Name]) -> tuple[str, str]:
-    """The instruction without what holds for all of it (speed, things to avoid), and that in the composer's words."""
+    """The instruction without its global qualifiers (speed, objects to avoid), and these in the composer's words."""
     text, extras = instruction.lower().strip().rstrip("."), ""
     avoiding = _AVOIDING.search(text)
     if avoiding:
@@ -97,7 +97,7 @@ def _with(sentence: str, extras: str) -> str:
 
 
 class _Planner:
-    """Writes subtasks and keeps track of what was moved: positions no longer tell moved things from their like."""
+    """Writes subtasks and tracks what was moved: positions no longer distinguish moved objects from equal ones."""
 
     def __init__(self, names: Sequence[Name]) -> None:
         self._names = names
@@ -125,7 +125,7 @@ class _Planner:
     # -- what is meant -------------------------------------------------------------------------------------------------
 
     def _things(self, noun: Noun) -> list[str]:
-        """How to speak of a movable thing; several where all of several are meant."""
+        """Phrases for a movable object; several where all of several are meant."""
         found = ground(noun, self._names)
         self._check_refs(found.noun)
         if found.noun.plural and not (found.noun.side or found.noun.relation):
@@ -138,7 +138,7 @@ class _Planner:
                 ground(ref, self._names)
 
     def _since_moved(self, found: Found) -> Found:
-        """The thing told by where it or its like was put, if its side or relation held before that."""
+        """The object identified by where it, or an equal one, was put, if its side or relation held before that."""
         for moved, place in reversed(self._moved):
             if not found.is_settled and moved.names == found.names:
                 kind = place.relation if moved.noun == found.noun else "outside"
@@ -147,7 +147,7 @@ class _Planner:
         return found
 
     def _place(self, place: Place) -> str:
-        """What to put something on or in: the part of the thing that the relation means."""
+        """The destination: the part of the object that the relation refers to."""
         if place.relation in {"near", "left_of", "right_of", "front_of", "back_of"} or place.thing.words == ("table",):
             return _place_thing(place, self._names).text
         found = self._since_moved(_place_thing(place, self._names))
@@ -155,7 +155,7 @@ class _Planner:
         return f"the {part.text}" if part else found.text
 
     def _half(self, place: Place) -> str:
-        """Which half of a flat place is for the next thing, where two are to stand on it."""
+        """The half of a flat place for the next object, where two are to stand on it."""
         if self._arrivals[place] != 2 or place.relation not in {"on", "top_of"}:
             return ""
         self._arrived[place] = self._arrived.get(place, 0) + 1

@@ -115,7 +115,7 @@ def _lmp(text: str) -> str:
     for call, lmp in _SIGNATURES:
         if call in text:
             return lmp
-    raise NotUnderstood("nothing in the request tells which LMP the program is for")
+    raise NotUnderstood("the request does not show which LMP it is for")
 
 
 def _objects(text: str) -> list[str]:
@@ -137,7 +137,7 @@ def _handler() -> Any:
     class OfflineWriter(CustomLLM):
         """Answers requests by rule."""
 
-        def completion(self, *args: Any, **kwargs: Any) -> litellm.ModelResponse:
+        def completion(self, *args: object, **kwargs: Any) -> litellm.ModelResponse:
             messages, options = kwargs["messages"], kwargs.get("optional_params") or {}
             if kwargs["model"].removeprefix(f"{PROVIDER}/") != MODEL.removeprefix(f"{PROVIDER}/"):
                 raise CustomLLMError(status_code=404, message=f"there is no {kwargs['model']!r}, only {MODEL}")
@@ -147,10 +147,10 @@ def _handler() -> Any:
                 raise CustomLLMError(status_code=400, message=f"{MODEL} does not understand: {error}") from error
             return _response(messages, *cut(program, _stops(options), options.get("max_tokens")))
 
-        async def acompletion(self, *args: Any, **kwargs: Any) -> litellm.ModelResponse:
+        async def acompletion(self, *args: object, **kwargs: object) -> litellm.ModelResponse:
             return self.completion(*args, **kwargs)
 
-        def streaming(self, *args: Any, **kwargs: Any) -> Iterator[Any]:
+        def streaming(self, *args: object, **kwargs: object) -> Iterator[Any]:
             raise CustomLLMError(status_code=400, message=f"{MODEL} does not stream")
 
     return OfflineWriter()

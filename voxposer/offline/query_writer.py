@@ -59,11 +59,11 @@ class _Locator:
         self._used: set[str] = {"cm", "distances", "face", "foot", "gap", "high", "low", "middle", "thing"}
 
     def locate(self, noun: Noun, inside: str = "") -> tuple[list[str], str]:
-        """Lines, and the expression that holds the thing after them.
+        """Lines, and the expression that holds the object after them.
 
         Args:
             noun: what to find.
-            inside: a relation; the part of the thing that holds what stands in it is meant.
+            inside: a relation; the part of the object that holds its contents is meant.
         """
         if noun.words == ("table",):
             return [], "detect('table')"
@@ -108,7 +108,7 @@ class _Locator:
         return lines, f"{several}[np.{'argmax' if away else 'argmin'}(distances)]"
 
     def _goal(self, relation: Relation) -> tuple[list[str], str]:
-        """The point that the thing meant is closest to: where the other thing is, or the middle of two."""
+        """The point that the wanted object is closest to: the other object, or the middle of two."""
         lines, points = [], []
         for ref in relation.refs:
             more, expression = self.locate(ref, "on" if relation.kind == "from" else relation.kind)
@@ -123,7 +123,7 @@ class _Locator:
         return lines, points[0]
 
     def _beside(self, relation: Relation, several: str) -> tuple[list[str], str]:
-        """The closest one on one side of a thing."""
+        """The closest one on one side of an object."""
         lines, goal = self._goal(relation)
         sign, axis = _BESIDE[relation.kind]
         condition = f"thing.position[{axis}] {sign} {goal}[{axis}]"
@@ -134,13 +134,13 @@ class _Locator:
 
 
 def _is_on(relation: Relation) -> bool:
-    """Whether it is said that a thing stands on another; what is taken "from" something that holds things was in it."""
+    """Whether the phrase says that an object stands on another; "from" a container means that it was in it."""
     inside = relation.kind == "from" and bool(_CONTAINERS.intersection(relation.refs[0].words))
     return relation.kind in {"on", "top_of", "from"} and not inside
 
 
 def _gaps(several: str, support: str) -> list[str]:
-    """How far the underside of each thing is from the upper face of another."""
+    """Distance of the underside of each object from the upper face of another."""
     return [
         f"low, high = {support}.aabb",
         "face = np.array([low[0], low[1], high[2]])",

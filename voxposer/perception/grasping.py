@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.contract import Part
 from vecenv.manipulation.grasps import Grasps, clearance, room_around
 from vecenv.manipulation.placing import choose_grasp
 from vecenv.manipulation.world import SceneGeometry, down_facing, pinching, spun, tilted, yaw
+from vecenv.observations import Part
 from voxposer.perception.config import PerceptionConfig
 from voxposer.perception.observation import PerceptionError
 from voxposer.perception.parts import distance, opening_direction

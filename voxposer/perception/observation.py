@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot
 from vecenv.errors import NotFound
+from vecenv.observations import ObjectsSnapshot
 from voxposer.language.observations import Observation
 
 
 class PerceptionError(NotFound):
-    """No object has this name, or the object does not offer what was asked for."""
+    """No object has this name, or the object does not have the requested field."""
 
 
 class LazyObservation(Observation):

@@ -1,7 +1,7 @@
 """Geometry of the parts of fixtures: which way they open, and what is free inside them.
 
-A :class:`~vecenv.contract.Part` (drawer, door, handle, knob, shelf, top) comes in; directions and boxes come out. Only
-surface points, joints and boxes decide; no names of tasks or assets are read.
+A :class:`~vecenv.observations.Part` (drawer, door, handle, knob, shelf, top) comes in; directions and boxes come out.
+Only surface points, joints and boxes decide; no names of tasks or assets are read.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vecenv.contract import Part, RegionBox
 from vecenv.manipulation.world import SceneGeometry
+from vecenv.observations import Part, RegionBox
 from voxposer.quaternions import unit
 
 _UP = np.array([0.0, 0.0, 1.0])

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vecenv.contract import Part
 from vecenv.manipulation.placing import Target, put_down
 from vecenv.manipulation.world import SceneGeometry, upright
+from vecenv.observations import Part
 from voxposer.perception.config import PerceptionConfig
 from voxposer.perception.grasping import HandPose
 from voxposer.perception.parts import cavity, exit_direction, world_half_extents

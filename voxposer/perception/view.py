@@ -1,6 +1,6 @@
 """One frozen snapshot, seen by name: the observations that programs read.
 
-One slot's :class:`~vecenv.contract.ObjectsSnapshot` and its :class:`~voxposer.perception.config.HandState` come in;
+One slot's :class:`~vecenv.observations.ObjectsSnapshot` and its :class:`~voxposer.perception.config.HandState` come in;
 :meth:`Perception.detect` gives observations by name. Names are the task's objects, their parts
 (``vecenv.libero.scene.parts`` names them), and a few aliases for the hand, the table and the held object. The goal of
 the task, its regions and its objects of interest are not read. Grasps and places are computed once per snapshot, when a
@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot, Part, PointCloud
 from vecenv.manipulation.placing import Target
 from vecenv.manipulation.world import SceneGeometry, matrix, upright
+from vecenv.observations import ObjectsSnapshot, Part, PointCloud
 from voxposer.perception.config import HandState, PerceptionConfig
 from voxposer.perception.grasping import GraspFinder, HandPose
 from voxposer.perception.grid import VoxelGrid

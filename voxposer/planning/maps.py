@@ -4,8 +4,8 @@
 In: points in metres (world frame) with the corners of a workspace, or volumes [..., N, N, N]. Out: voxel indices,
 occupancy, distances, blurred and scaled volumes. Everything takes leading batch axes, and volumes may be traced by JAX.
 
-What decides between two voxels of nearly equal cost is the last bit of the cost, so these operations give the bits that
-SciPy gives: squared distances are integers, and the blur sums its taps in SciPy's order, with products rounded before
+The last bit of the cost decides between two voxels of nearly equal cost, so these operations give the same bits as
+SciPy: squared distances are integers, and the blur sums its taps in SciPy's order, with products rounded before
 they are added. Where float64 is not enabled they give the float32 counterpart.
 """
 
@@ -17,8 +17,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Num, Shaped
+from jaxtyping import Array, Bool, Float, Integer, Num, Shaped
 
 AnyArray = Array | np.ndarray
 
@@ -105,11 +106,11 @@ def voxelize(
     return grid.reshape(*points.shape[:-2], size, size, size)
 
 
-def squared_distance(occupied: Bool[Array, "*batch N M K"]) -> Int[Array, "*batch N M K"]:
+def squared_distance(occupied: Bool[Array, "*batch N M K"]) -> Integer[Array, "*batch N M K"]:
     """Squared distance in voxels from every voxel to the nearest occupied one, exactly.
 
     One min-plus product per axis (Felzenszwalb and Huttenlocher's decomposition without its envelope: at these sizes
-    comparing all pairs along a line is quicker, because it vectorises).
+    comparing all pairs along a line is faster, because it vectorises).
 
     Args:
         occupied: bool [..., N, M, K].
@@ -128,7 +129,7 @@ def squared_distance(occupied: Bool[Array, "*batch N M K"]) -> Int[Array, "*batc
 
 
 def unreachable(shape: tuple[int, ...]) -> int:
-    """What ``squared_distance`` says where there is nothing to be near to: one more than any squared distance."""
+    """The value of ``squared_distance`` in an empty volume: one more than any squared distance."""
     return sum((n - 1) ** 2 for n in shape) + 1
 
 
@@ -180,7 +181,7 @@ def preprocess_avoidance(
     movable: Shaped[AnyArray, "*batch N N N"] | None = None,
     start: Num[AnyArray, "*batch 3"] | None = None,
 ) -> Float[AnyArray, "*batch N N N"]:
-    """Add the scene's occupancy to an avoidance map, but not near the targets nor near what moves.
+    """Add the scene's occupancy to an avoidance map, except near the targets and the moving object.
 
     Upstream's ``_preprocess_avoidance_map``: the scene does not count closer than 15 % of the side to a target voxel,
     nor closer than that to the moving object's voxels; for the hand, which has no occupancy, it does not count in a box
@@ -228,12 +229,12 @@ def _clearance(
 
 
 def opaque_zero(volume: jax.Array) -> jax.Array:
-    """An integer 0, as wide as the floats, that no compiler foresees: it would be 1 if there were a NaN."""
+    """An integer 0, as wide as the floats, that a compiler cannot fold: it would be 1 if there were a NaN."""
     return jnp.isnan(jnp.max(volume)).astype(_bits(volume.dtype))
 
 
 def rounded(product: jax.Array, zero: jax.Array) -> jax.Array:
-    """The product as it is, out of reach of the fused multiply-add with which compilers save its rounding.
+    """The rounded product, protected from compilers that would fuse it with an addition.
 
     Args:
         product: any floats.
@@ -272,7 +273,7 @@ def _min_plus(squares: jax.Array, axis: int) -> jax.Array:
     return lax.fori_loop(0, n, row, most, unroll=min(_ROWS_AT_ONCE, n))
 
 
-def _of_rank(rank: int, *arrays: Any) -> tuple[Any, ...]:
+def _of_rank(rank: int, *arrays: AnyArray) -> tuple[Any, ...]:
     """Arrays with leading axes of length 1, so that they have this rank."""
     return tuple(array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays)
 
@@ -281,15 +282,15 @@ def _float() -> Any:
     return jnp.zeros(0).dtype
 
 
-def _bits(dtype: Any) -> Any:
+def _bits(dtype: npt.DTypeLike) -> Any:
     return jnp.int64 if dtype == jnp.float64 else jnp.int32
 
 
-def _namespace(array: Any) -> Any:
+def _namespace(array: object) -> Any:
     return jnp if isinstance(array, jax.Array) else np
 
 
-def _require_bounds(points: Any, lower: Any, upper: Any) -> None:
+def _require_bounds(points: object, lower: object, upper: object) -> None:
     if isinstance(lower, np.ndarray) and isinstance(upper, np.ndarray) and not (upper > lower).all():
         raise ValueError(f"a workspace needs upper > lower on every axis, got {lower.tolist()} and {upper.tolist()}")
     if isinstance(points, np.ndarray) and not np.isfinite(points).all():

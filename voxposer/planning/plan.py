@@ -2,8 +2,8 @@
 """Plans of a batch of hands, as tensors that ``env.step_waypoints`` executes in one call.
 
 :class:`Stop` s of each slot come in (``vecenv.manipulation.routes``); a :class:`SubtaskPlan` goes out, a pytree of
-arrays. Changes of the grip are expanded: fingers need physics ticks to move, so the hand first drives to where the grip
-changes with the previous grip, then holds there while the fingers move. The grip carries over from plan to plan.
+arrays. Changes of the grip are expanded: fingers need physics ticks to move, so the hand first drives to the place of
+the change with the previous grip, then holds still while the fingers move. The grip carries over from plan to plan.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def expand_flips(
 
 
 def slowed(stops: Sequence[Stop], config: PlanConfig = PlanConfig()) -> list[Stop]:
-    """The stops, with more of them between where the way from one to the next is to be slow."""
+    """The stops, with more stops between those that are approached slowly."""
     result = list(stops[:1])
     for before, stop in itertools.pairwise(stops):
         if stop.velocity < 1:
@@ -132,10 +132,10 @@ def stack(rows: Sequence[Sequence[PlannedWaypoint]], config: PlanConfig = PlanCo
 
 
 def remaining(plan: SubtaskPlan, ticks: Int[np.ndarray, "B T"]) -> SubtaskPlan:
-    """What is left of a plan that some slots gave up on.
+    """The rest of a plan after some slots gave up.
 
-    A slot gives up after several waypoints in a row that it could not reach. It goes on where the grip changes next:
-    what leads there is out of reach, but a hand that is in the way of nothing can still close or let go.
+    A slot gives up after several waypoints in a row that it could not reach. It resumes at the next change of
+    the grip: the waypoints before it are out of reach, but the hand can still close or open where it is.
 
     Args:
         plan: the plan.

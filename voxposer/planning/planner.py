@@ -8,17 +8,19 @@ NumPy and SciPy's would, which takes float64, SciPy's order of summation and Num
 
 ``optimize_paths`` is one jitted function for any device, and may be traced into a larger one, if that is compiled with
 float64 enabled (JAX cannot lower float64 within a float32 function). Called with concrete arrays on a CPU it does the
-descent in ``planner_numba``, which finds the same voxels several times quicker.
+descent in ``planner_numba``, which finds the same voxels several times faster.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Num, Shaped
@@ -94,7 +96,9 @@ def optimize_paths(
         return _with_jax(*arrays, config)
 
 
-def _checked(start: Any, target: Any, obstacle: Any, object_centric: Any) -> tuple[Any, Any, Any, Any]:
+def _checked(
+    start: npt.ArrayLike, target: npt.ArrayLike, obstacle: npt.ArrayLike, object_centric: npt.ArrayLike
+) -> tuple[Any, Any, Any, Any]:
     arrays = tuple(x if isinstance(x, jax.Array) else np.asarray(x) for x in (start, target, obstacle, object_centric))
     slots, size = arrays[0].shape[:1], arrays[1].shape[-1:]
     wanted = {"start": (*slots, 3), "target": (*slots, *size * 3), "obstacle": (*slots, *size * 3)}
@@ -106,7 +110,7 @@ def _checked(start: Any, target: Any, obstacle: Any, object_centric: Any) -> tup
     return cast(tuple[Any, Any, Any, Any], arrays)
 
 
-def _on_cpu(arrays: tuple[Any, ...]) -> bool:
+def _on_cpu(arrays: Sequence[maps.AnyArray]) -> bool:
     placed = [device.platform for array in arrays if isinstance(array, jax.Array) for device in array.devices()]
     return all(platform == "cpu" for platform in placed or [jax.default_backend()])
 
@@ -115,7 +119,13 @@ def _on_cpu(arrays: tuple[Any, ...]) -> bool:
 # The two engines of the raw path.
 
 
-def _with_numba(start: Any, target: Any, obstacle: Any, planar: Any, config: PlannerConfig) -> Paths:
+def _with_numba(
+    start: Num[maps.AnyArray, "B 3"],
+    target: Shaped[maps.AnyArray, "B N N N"],
+    obstacle: Shaped[maps.AnyArray, "B N N N"],
+    planar: Shaped[maps.AnyArray, " B"],
+    config: PlannerConfig,
+) -> Paths:
     target, obstacle, planar = np.asarray(target), np.asarray(obstacle), np.asarray(planar, bool)
     raw, length, fault = planner_numba.descend(np.asarray(start), target, obstacle, planar, config)
     path, path_length = _shape(raw, length, config, target.shape[-1])
@@ -124,13 +134,19 @@ def _with_numba(start: Any, target: Any, obstacle: Any, planar: Any, config: Pla
 
 
 @partial(jax.jit, static_argnames="config")
-def _with_jax(start: Any, target: Any, obstacle: Any, planar: Any, config: PlannerConfig) -> Paths:
+def _with_jax(
+    start: Num[maps.AnyArray, "B 3"],
+    target: Shaped[maps.AnyArray, "B N N N"],
+    obstacle: Shaped[maps.AnyArray, "B N N N"],
+    planar: Shaped[maps.AnyArray, " B"],
+    config: PlannerConfig,
+) -> Paths:
     plan = partial(_plan, config=config)
     arrays = start, target, obstacle, planar.astype(bool)
     return lax.platform_dependent(*arrays, cpu=partial(_in_parts, plan, 1), default=partial(_in_parts, plan, None))
 
 
-def _in_parts(plan: Any, at_once: int | None, *arrays: jax.Array) -> Paths:
+def _in_parts(plan: Callable[..., Paths], at_once: int | None, *arrays: jax.Array) -> Paths:
     """Apply ``plan`` to some slots after the other, which bounds the memory."""
     slots = len(arrays[0])
     if not slots:
@@ -191,6 +207,12 @@ class _Descent(NamedTuple):
     length: jax.Array
 
 
+def _surroundings(padded: Float[Array, "B P P P"], here: Int[Array, "B 3"], margin: int) -> Float[Array, "B K"]:
+    """Costs around voxels, from volumes padded by ``margin``, in the order of ``neighbour_offsets``."""
+    block = (2 * margin + 1,) * 3
+    return jax.vmap(lambda cost, at: lax.dynamic_slice(cost, at, block))(padded, here).reshape(len(here), -1)
+
+
 def _descend(
     start: Int[Array, "B 3"], cost: Float[Array, "B N N N"], planar: Bool[Array, " B"], config: PlannerConfig
 ) -> tuple[Int[Array, "B steps 3"], Int[Array, " B"]]:
@@ -205,10 +227,6 @@ def _descend(
     # Beyond the border everything costs infinitely much, which is as good as not being there.
     padded = jnp.pad(cost, [(0, 0), *[(margin, margin)] * 3], constant_values=jnp.inf)
 
-    def surroundings(cost: jax.Array, here: jax.Array) -> jax.Array:
-        block = (2 * margin + 1,) * 3
-        return jax.vmap(lambda c, at: lax.dynamic_slice(c, at, block))(cost, here).reshape(len(slots), -1)
-
     def candidates(around: jax.Array, here: jax.Array, flat: jax.Array) -> jax.Array:
         # Upstream takes out the voxel itself before clipping to the grid, and clipping at a border brings it back.
         edge = (here == 0) | (here == size - 1)
@@ -221,7 +239,7 @@ def _descend(
         there = jnp.where(d.active[:, None], d.here + offsets[choice], d.here)
         x, y, z = (d.here + margin).T
         cost = d.cost.at[slots, x, y, z].add(d.active.astype(d.cost.dtype), unique_indices=True)
-        around = surroundings(cost, there)
+        around = _surroundings(cost, there, margin)
         worth = candidates(around, there, jnp.zeros_like(planar)) < around[:, middle, None] + config.stop_threshold
         raw = lax.dynamic_update_index_in_dim(d.raw, there, d.step + 1, 1)
         length = jnp.where(d.active, d.step + 2, d.length)
@@ -232,7 +250,7 @@ def _descend(
         step=jnp.zeros((), jnp.int32),
         here=start,
         active=jnp.ones(len(start), bool),
-        around=surroundings(padded, start),
+        around=_surroundings(padded, start, margin),
         cost=padded,
         raw=raw,
         length=jnp.ones(len(start), jnp.int32),
@@ -287,7 +305,9 @@ def _finish(
 ) -> Paths:
     """Lead each path to its ``end`` [B, 3] where ``snap`` [B] says so, thin out those of objects, and pack up."""
 
-    def one(path: jax.Array, length: jax.Array, last: jax.Array, end: jax.Array, snap: jax.Array, planar: Any) -> Any:
+    def one(
+        path: jax.Array, length: jax.Array, last: jax.Array, end: jax.Array, snap: jax.Array, planar: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         height = jnp.where(planar, jnp.clip(jnp.round(last[2]), 0, size - 1), end[2])
         path = jnp.concatenate([path, path[-1:]])
         behind = (jnp.arange(len(path)) >= length)[:, None]
@@ -387,7 +407,7 @@ def _every(path: Float[Array, "L 3"], length: Int[Array, ""], k: int) -> tuple[F
 def _last(path: Float[Array, "B L 3"], length: Int[Array, " B"]) -> Float[Array, "B 3"]:
     """Where each path ends, [B, 3], the nearest billionth of a voxel.
 
-    The window is a few samples of whole numbers, so a smoothed path does end half-way between voxels, give or take the
-    rounding of whatever fitted the polynomial. Upstream leaves the choice to that rounding.
+    The window is a few samples of whole numbers, so a smoothed path does end half-way between voxels, up to the
+    rounding of the fit. Upstream leaves the choice to that rounding.
     """
     return jnp.round(path[jnp.arange(len(path)), length - 1], 9)

@@ -4,9 +4,9 @@ In: NumPy arrays, B slots. Out: raw paths, lengths and faults, and the targets t
 of ``planner``'s JAX functions and of SciPy: distances are exact, and each sum is taken in the same order, without
 fast-math and fused multiplication.
 
-Quicker than XLA's loops for three reasons. A blur goes through the volume plane by plane, which stays in a core's
-cache. Rows in which nothing is occupied are skipped, exactly, since they would add zero. And each core works on a slot
-of its own.
+Faster than XLA's loops for three reasons. A blur goes through the volume plane by plane, which stays in a core's
+cache. Rows in which nothing is occupied are skipped, exactly, since they would add zero. And each core works on
+a different slot.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def _over_cores(work: Callable[[int], None], slots: int) -> None:
 
 
 @part
-def _finite(volume: Any) -> bool:
+def _finite(volume: np.ndarray) -> bool:
     broken = 0
     for value in volume.ravel():
         # NaN for NaN and infinity, which equals nothing.
@@ -111,7 +111,7 @@ def _finite(volume: Any) -> bool:
 
 
 @part
-def _blur(volume: Any, half: Any, fold: Any, out: Any) -> None:
+def _blur(volume: np.ndarray, half: np.ndarray, fold: np.ndarray, out: np.ndarray) -> None:
     """``gaussian_blur`` of [N, N, N]: axis 0, then 1, then 2; ``fold`` [N + 2 radius] says where samples are."""
     n = volume.shape[0]
     low, high = _occupied_heights(volume)
@@ -150,14 +150,14 @@ def _blur(volume: Any, half: Any, fold: Any, out: Any) -> None:
 
 @part
 def _blur_rows(
-    source: Any,
+    source: np.ndarray,
     first: int,
     columns: int,
-    half: Any,
-    fold: Any,
-    live: Any,
-    taps: Any,
-    out: Any,
+    half: np.ndarray,
+    fold: np.ndarray,
+    live: np.ndarray,
+    taps: np.ndarray,
+    out: np.ndarray,
 ) -> None:
     """Correlate some columns of ``source`` [n, m] along axis 0 into ``out`` [n, columns], outermost taps first.
 
@@ -195,7 +195,7 @@ def _blur_rows(
 
 
 @part
-def _find_live(source: Any, first: int, columns: int, live: Any) -> bool:
+def _find_live(source: np.ndarray, first: int, columns: int, live: np.ndarray) -> bool:
     """Write which rows of some columns of ``source`` [n, m] are not all zero; whether any is not."""
     some = False
     for i in range(len(live)):
@@ -208,7 +208,7 @@ def _find_live(source: Any, first: int, columns: int, live: Any) -> bool:
 
 
 @part
-def _occupied_heights(volume: Any) -> Any:
+def _occupied_heights(volume: np.ndarray) -> Any:
     """First index along the last axis with something other than zero, and one more than the last such index."""
     n = volume.shape[0]
     some = np.zeros(n, np.int8)
@@ -225,7 +225,7 @@ def _occupied_heights(volume: Any) -> Any:
 
 
 @part
-def _squares(target: Any, out: Any) -> bool:
+def _squares(target: np.ndarray, out: np.ndarray) -> bool:
     """``squared_distance`` to the voxels of [N, N, N] that equal 1; False if there are none."""
     n = target.shape[0]
     planes, rows, columns = np.zeros(n, np.bool_), np.zeros(n, np.bool_), _STRIP * n
@@ -247,7 +247,7 @@ def _squares(target: Any, out: Any) -> bool:
 
 
 @part
-def _line_squares(target: Any, out: Any) -> bool:
+def _line_squares(target: np.ndarray, out: np.ndarray) -> bool:
     """Squared distances along a line [n]; False, and nothing written, without a target on it."""
     last, n = -1, len(out)
     for z in range(n):
@@ -261,7 +261,7 @@ def _line_squares(target: Any, out: Any) -> bool:
 
 
 @part
-def _spread(rows: Any, first: int, columns: int, live: Any, out: Any) -> None:
+def _spread(rows: np.ndarray, first: int, columns: int, live: np.ndarray, out: np.ndarray) -> None:
     """``out[i] = min over live j of rows[j] + (i - j)²`` for some columns of ``rows`` [n, m]; ``out`` [n, columns]."""
     for i in range(out.shape[0]):
         best = out[i]
@@ -277,13 +277,13 @@ def _spread(rows: Any, first: int, columns: int, live: Any, out: Any) -> None:
 
 
 def _cost(
-    target: Any,
-    obstacle: Any,
-    half: Any,
-    fold: Any,
+    target: np.ndarray,
+    obstacle: np.ndarray,
+    half: np.ndarray,
+    fold: np.ndarray,
     weight: float,
     obstacle_weight: float,
-    out: Any,
+    out: np.ndarray,
 ) -> int:
     """``cost_map`` into ``out`` [N, N, N], or why there is none."""
     n = out.shape[0]
@@ -323,7 +323,7 @@ def _cost(
     return 0
 
 
-def _walk(cost: Any, raw: Any, planar: bool, offsets: Any, threshold: float) -> int:
+def _walk(cost: np.ndarray, raw: np.ndarray, planar: bool, offsets: np.ndarray, threshold: float) -> int:
     """``_descend`` for one slot: writes the path into ``raw`` [L, 3], whose first row is the start, and ``cost``."""
     length = 1
     here = np.empty(3, np.int64)
@@ -346,7 +346,7 @@ def _walk(cost: Any, raw: Any, planar: bool, offsets: Any, threshold: float) -> 
 
 
 @part
-def _cheapest(cost: Any, here: Any, planar: bool, offsets: Any) -> Any:
+def _cheapest(cost: np.ndarray, here: np.ndarray, planar: bool, offsets: np.ndarray) -> Any:
     """First of the cheapest neighbours, as a row of ``offsets``, and its cost."""
     size, choice, least = cost.shape[0], -1, np.inf
     # A voxel at a border is its own neighbour, because offsets that leave the grid are clipped to it.
@@ -363,7 +363,7 @@ def _cheapest(cost: Any, here: Any, planar: bool, offsets: Any) -> Any:
     return choice, least
 
 
-def _nearest(target: Any, voxel: Any, end: Any) -> None:
+def _nearest(target: np.ndarray, voxel: np.ndarray, end: np.ndarray) -> None:
     """Write the first of the target voxels nearest to ``voxel`` into ``end``; nothing if there is none."""
     size, least = target.shape[0], 3 * target.shape[0] ** 2
     for x in range(size):

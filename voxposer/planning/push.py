@@ -1,26 +1,26 @@
 # ruff: noqa: F722  (shapes in annotations)
-"""Pushing: which push moves a thing closest to where it should go, and the hand's waypoints for it.
+"""Pushing: the push that moves an object closest to its goal, and the hand's waypoints for it.
 
-In, for each slot: the thing's surface points and the place its centre is to reach, world frame, metres. Out: ``Push``
+In, for each slot: the object's surface points and the goal of its centre, world frame, metres. Out: ``Push``
 (where to touch, which way, how far), and from it poses for the hand, closed, slanted, kept above the table.
 
 This is the model-predictive control of VoxPoser's object-centric subtasks (huangwl18/VoxPoser @ e3a4c9e,
-``controllers.py`` and ``dynamics_models.py``): sample thousands of pushes, predict each with a model in which the thing
-moves along with the hand, take the best, push, look again. Upstream moves a copy of the whole cloud for each sample and
-then takes its mean. A translation moves the mean by itself, so here a sample costs a handful of operations and the
-costs are the same.
+``controllers.py`` and ``dynamics_models.py``): sample thousands of pushes, predict each with a model in which the
+object moves along with the hand, take the best, push, observe again. Upstream moves a copy of the whole cloud for each
+sample and then takes its mean. A translation moves the mean equally, so here a sample takes only a few operations and
+the costs are the same.
 
-Three things differ for the sake of a real hand. Pushing from further back on the same line predicts the same, so the
+Three points differ, to suit a real hand. Pushing from further back on the same line predicts the same, so the
 chosen contact is moved to where the hand, coming from behind, first touches. By default directions are level: a hand on
 its way to a target a centimetre lower would press on the table. And by default no distance is negative: upstream's
-model lets a hand beyond the target draw the thing back by 2 cm, which a closed hand cannot.
+model lets a hand beyond the target pull the object back by 2 cm, which a closed hand cannot do.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,10 +42,10 @@ class PushConfig:
 
     Attributes:
         num_samples: pushes tried per call.
-        min_distance: shortest push tried; upstream's is -0.02, and a negative push draws the thing towards the hand.
+        min_distance: shortest push tried; upstream's is -0.02, and a negative push pulls the object towards the hand.
         max_distance: longest push tried.
         level: push horizontally, and judge by the horizontal distance to the target. False is upstream's way.
-        hand_width: of the closed hand, across the push; where it meets the thing within this is where it touches.
+        hand_width: of the closed hand, across the push; the contact is the first point of the object within it.
         start_distance: how far before the contact the push starts.
         retreat: share of ``start_distance`` to which the hand draws back after it.
         lift: how far above start and end the hand comes and goes.
@@ -120,10 +120,10 @@ def best_push(
     valid: Bool[AnyArray, "B M"] | None = None,
     normals: Num[AnyArray, "B M 3"] | None = None,
     touchable: Shaped[AnyArray, "B M"] | None = None,
-    lowest: Num[AnyArray, " B"] | float | None = None,
-    highest: Num[AnyArray, " B"] | float | None = None,
+    lowest: Num[AnyArray, " B"] | Num[AnyArray, ""] | float | None = None,
+    highest: Num[AnyArray, " B"] | Num[AnyArray, ""] | float | None = None,
 ) -> Push:
-    """The push that is predicted to bring each thing's centre closest to its target.
+    """The push that is predicted to bring each object's centre closest to its target.
 
     Args:
         points: surface of the object, metres, [B, M, 3].
@@ -131,9 +131,9 @@ def best_push(
         key: one ``jax.random`` key, or one a slot, [B]: then a slot's push does not depend on the batch it is in.
         config: numbers of the search.
         valid: bool [B, M], False for padding; None for no padding. Points that are not finite are left out as well.
-        normals: outward normals of the surface, [B, M, 3]. Given these, a push moves the thing if the face that it
-            touches looks against it, the inside of a rim for example; without, if it does not lead away from the
-            centre (upstream's rule, right for convex things).
+        normals: outward normals of the surface, [B, M, 3]. With normals, a push moves the object if it is
+            directed against the face that it touches, the inside of a rim for example; without, if it is not directed
+            away from the centre (upstream's rule, right for convex objects).
         touchable: bool [B, M], points that the hand can come to; None for all. Where there are none, all count.
         lowest: world height below which the hand must not touch, [B] or a number: the table and some clearance.
         highest: world height above which it must not, [B] or a number. Where no point lies between, the contact is
@@ -150,14 +150,21 @@ def best_push(
         raise ValueError(f"points and target must be [B, M, 3] and [B, 3], got {points.shape} and {target.shape}")
     slots = len(points)
     low, high = (_heights(limit, default, slots) for limit, default in ((lowest, -jnp.inf), (highest, jnp.inf)))
-    usable = jnp.isfinite(points).all(-1)
-    usable = usable if valid is None else usable & valid
+    usable, free = _usable_and_free(points, valid, touchable)
     points = jnp.where(usable[..., None], points, 0)
-    free = usable if touchable is None else usable & jnp.asarray(touchable, bool)
-    free = jnp.where(free.any(-1, keepdims=True), free, usable)
     search = jax.vmap(partial(_search, config=config), in_axes=(0, 0, 0, None if normals is None else 0, 0, 0, 0, 0))
     normals = None if normals is None else jnp.asarray(normals)
     return search(points, usable, free, normals, target, _keys(key, slots), low, high)
+
+
+def _usable_and_free(
+    points: Num[Array, "B M 3"], valid: Bool[AnyArray, "B M"] | None, touchable: Shaped[AnyArray, "B M"] | None
+) -> tuple[Bool[Array, "B M"], Bool[Array, "B M"]]:
+    """Points that count, and those of them that the hand can come to: all where there are none, bool [B, M] each."""
+    usable = jnp.isfinite(points).all(-1)
+    usable = usable if valid is None else usable & valid
+    free = usable if touchable is None else usable & jnp.asarray(touchable, bool)
+    return usable, jnp.where(free.any(-1, keepdims=True), free, usable)
 
 
 def push_costs(
@@ -168,15 +175,15 @@ def push_costs(
     distance: Float[Array, " S"],
     moves: Bool[Array, " S"] | None = None,
 ) -> tuple[Float[Array, "S 3"], Float[Array, " S"]]:
-    """The pushing model for S samples: the thing's centre moves along, unless the hand moves away from it.
+    """The pushing model for S samples: the object's centre moves along, unless the hand moves away from it.
 
     Args:
-        centre: mean of the thing's points, [3].
+        centre: mean of the object's points, [3].
         target: where it should be, [3].
         contact: where each sample touches, [S, 3].
         direction: which way each goes, unit, [S, 3].
         distance: how far, [S].
-        moves: bool [S], whether the push has hold of the thing; None to judge by its leading away from the centre.
+        moves: bool [S], whether the push moves the object; None if that depends on its direction from the centre.
 
     Returns:
         Predicted centres [S, 3] and their distances to the target [S].
@@ -271,7 +278,7 @@ def _behind(
     direction: Float[Array, " 3"],
     config: PushConfig,
 ) -> Float[Array, ""]:
-    """How far the thing reaches back from a contact, against the push: in the hand's way, not before its start."""
+    """How far the object extends behind a contact, in the path of the hand and after its start."""
     offset = points - contact[None]
     back = -(offset * direction[None]).sum(-1)
     aside = offset + back[:, None] * direction[None]
@@ -300,7 +307,7 @@ def _unit(vectors: Float[Array, "*B 3"]) -> Float[Array, "*B 3"]:
     return jnp.where(length > _NO_WAY, vectors / jnp.where(length > _NO_WAY, length, 1), 0)
 
 
-def _heights(limit: Any, default: Any, slots: int) -> jax.Array:
+def _heights(limit: Num[AnyArray, " B"] | Num[AnyArray, ""] | float | None, default: float, slots: int) -> jax.Array:
     return jnp.broadcast_to(jnp.asarray(default if limit is None else limit, jnp.float32), (slots,))
 
 

@@ -1,8 +1,8 @@
-"""Which values a program may hold, and how much it may use: kinds of values, limits, and the meters that count.
+"""The kinds of values that a program may hold, and the limits on what it may use.
 
-In: values as they come into being while ``voxposer.sandbox`` interprets a program. Out: the same values, or a
+In: values as they are created while ``voxposer.sandbox`` interprets a program. Out: the same values, or a
 ``Refusal`` with the rule it breaks. Sizes are checked before anything is allocated. Nothing here knows about syntax;
-the interpreter adds the line.
+the interpreter adds the line number.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-# Meters of the array work one interpreter step stands for: a thousand elements take about as long as one node.
+# Array elements that count as one interpreter step: working on them takes about as long as one node.
 ELEMENTS_A_STEP = 1000
-# Steps between two looks at the clock.
+# Steps between two readings of the clock.
 _STEPS_A_LOOK = 500
-# Bytes counted for an item of a list, a tuple of two numbers included, and for a character.
+# Bytes counted for an item of a list (enough for a tuple of two numbers), and for a character.
 _ITEM_BYTES, _CHARACTER_BYTES = 100, 4
-# NumPy's ways to print or roll an array grow exponentially with this.
+# Largest number of dimensions of an array: the cost of printing or rolling one grows exponentially with it.
 _DIMENSIONS = 8
 
 
 class Refusal(Exception):
-    """A program broke a rule.
+    """A program violates a rule.
 
     Attributes:
         rule: short name of the rule, one of ``voxposer.sandbox.syntax.RULES``.
-        reason: what was asked and what would be right.
+        reason: what the program did, and what is allowed.
     """
 
     def __init__(self, rule: str, reason: str) -> None:
@@ -45,7 +45,7 @@ class HostFault(Exception):
 
 
 class Record(ABC):
-    """A value of the host whose named fields programs may read, as ``x.name`` or ``x["name"]``; they never write."""
+    """A value of the host whose named fields programs may read, as ``x.name`` or ``x["name"]``, but not write."""
 
     @abstractmethod
     def fields(self) -> Collection[str]:
@@ -53,19 +53,19 @@ class Record(ABC):
 
     @abstractmethod
     def __getitem__(self, name: str, /) -> Any:
-        """The field's value; arrays are the reader's own copies."""
+        """The field's value; arrays are copies."""
 
 
 class RecordList(Sequence[Record]):
-    """Several records: programs take its length, index it and loop over it."""
+    """Several records. Programs may take its length, index it and loop over it."""
 
 
 class Opaque:
-    """A value of the host that programs may keep and hand to the host's functions, and nothing else."""
+    """A value of the host that programs can only store and pass to the host's functions."""
 
 
 class DType:
-    """A number type that a program names, as in ``x.astype(int)``: an argument, not a value."""
+    """A number type such as ``int`` in ``x.astype(int)``: allowed as an argument, not as a value."""
 
     def __init__(self, name: str, dtype: type[np.generic]) -> None:
         self.name, self.dtype = name, dtype
@@ -81,11 +81,11 @@ class Limits:
         steps: nodes interpreted, with a thousand array elements worked on counted as one more; shared by the programs
             that one program calls.
         calls: calls of the host's functions and reads of its records; shared likewise.
-        programs: further programs that the model is asked for; shared likewise.
-        seconds: time spent in programs, the host's own time not counted; shared likewise.
-        memory_bytes: what one run of one program makes, whether still alive or not.
+        programs: further programs requested from the model; shared likewise.
+        seconds: time spent in programs, excluding the host's functions; shared likewise.
+        memory_bytes: all that one run of one program allocates, freed or not.
         array_elements: elements of one array.
-        items: items of a list, tuple or dictionary, and of what it holds in turn.
+        items: items of a list, tuple or dictionary, nested ones included.
         text_chars: characters of a string.
         integer_bits: bits of an integer.
     """
@@ -104,7 +104,7 @@ class Limits:
 
 
 class Budget:
-    """Steps, calls and time of a program and of all programs run on its behalf."""
+    """Steps, calls and time left to a program and to all programs that it calls."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
@@ -114,7 +114,7 @@ class Budget:
         self._since: float | None = None
 
     def step(self, count: int = 1) -> None:
-        """Use up steps; look at the clock now and then."""
+        """Count steps, and check the time every few hundred."""
         self._steps -= count
         self._unseen += count
         if self._steps < 0:
@@ -124,20 +124,20 @@ class Budget:
             self._look()
 
     def call(self) -> None:
-        """Use up one call of the host."""
+        """Count one call of the host."""
         self._calls -= 1
         if self._calls < 0:
             raise Refusal("calls", f"more than {self.limits.calls} calls of given functions and reads of observations")
 
     def program(self) -> None:
-        """Use up one of the further programs that are asked for."""
+        """Count one further program requested from the model."""
         self._programs -= 1
         if self._programs < 0:
             raise Refusal("calls", f"more than {self.limits.programs} further programs were asked for")
 
     @contextlib.contextmanager
     def clock(self, running: bool) -> Iterator[None]:
-        """Let the clock run (in a program) or stand still (in the host), and put it back afterwards."""
+        """Run the clock (in a program) or stop it (in the host); its previous state is restored afterwards."""
         was_running = self._since is not None
         self._set(running)
         try:
@@ -158,7 +158,7 @@ class Budget:
 
 
 class Guard:
-    """The meters of one run of one program; every function a program may call gets it first."""
+    """Checks and counts what one run of one program uses; every function a program may call gets it first."""
 
     def __init__(self, budget: Budget) -> None:
         self.budget, self.limits = budget, budget.limits
@@ -170,12 +170,12 @@ class Guard:
         self._memory -= size
 
     def require_memory(self, size: int) -> None:
-        """Refuse what would not fit."""
+        """Refuse an allocation that would exceed the memory limit."""
         if size > self._memory:
             raise Refusal("memory", f"values of more than {self.limits.memory_bytes} bytes in all")
 
     def room(self, shape: Sequence[int], itemsize: int = 8) -> None:
-        """Refuse an array that would be too large, before it is made; the work of making it is counted."""
+        """Refuse an array that would be too large, before it is allocated; its elements count as steps."""
         if len(shape) > _DIMENSIONS:
             raise Refusal("size", f"an array of {len(shape)} dimensions; {_DIMENSIONS} are allowed")
         elements = math.prod(int(length) for length in shape)
@@ -199,8 +199,8 @@ class Guard:
         if count > self.limits.integer_bits:
             raise Refusal("size", f"an integer of more than {self.limits.integer_bits} bits")
 
-    def take(self, value: Any) -> Any:
-        """A value that has just been made, checked and its memory counted; views count as what they show."""
+    def take(self, value: object) -> Any:
+        """A new value, checked, with its memory counted; a view counts as an array of its size."""
         if isinstance(value, np.ndarray):
             require_numbers(value)
             self.room(value.shape, value.itemsize)
@@ -218,40 +218,40 @@ class Guard:
             kind_of(value)
         return value
 
-    def take_all(self, value: Any) -> Any:
-        """A function's result: a list's or tuple's items are taken too."""
+    def take_all(self, value: object) -> Any:
+        """A function's result, checked together with the items of a list or tuple."""
         if isinstance(value, (list, tuple)):
             self.weigh(value)
             for item in value:
                 self.take(item)
         return self.take(value)
 
-    def host(self, name: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        """What a function of the host returns, its time not counted.
+    def host(self, name: str, function: Callable[..., Any], *arguments: object, **named: object) -> Any:
+        """Call a function of the host, its time not counted.
 
         Raises:
-            Refusal: it raised something other than a ``HostFault``, which is the cause, or returned what programs may
-                not hold.
+            Refusal: it raised something other than a ``HostFault`` (the refusal's cause), or returned a value that
+                programs may not hold.
         """
         self.budget.call()
         try:
             with self.budget.clock(running=False):
                 value = function(*arguments, **named)
-        except (HostFault, Refusal):  # a refusal comes from this budget, on which a program within drew
+        except (HostFault, Refusal):  # a nested program exceeded this budget
             raise
         except Exception as error:
             raise Refusal("call", f"{name}: {type(error).__name__}: {error}") from error
         given = any(value is argument for argument in (*arguments, *named.values()))
         return value if given else self.take_all(value)
 
-    def weigh(self, value: Any) -> Weight:
-        """What a value holds, its lists' lists included, each counted wherever it appears.
+    def weigh(self, value: object) -> Weight:
+        """Count what a value contains, nested lists included; shared items count each time they appear.
 
-        Shared lists can stand for exponentially many items, and a list may hold itself: what is handed to a function
-        that walks lists goes through here first.
+        Shared lists can represent exponentially many items, and a list may contain itself, so every value that is
+        passed to a function that walks lists is checked here first.
 
         Raises:
-            Refusal: there are too many, they nest too deep, or one is no value a program may hold.
+            Refusal: there are too many, they nest too deep, or one is not a value that programs may hold.
         """
         pending: list[tuple[Any, int]] = [(value, 0)]
         seen, leaves = 0, []
@@ -274,7 +274,7 @@ class Guard:
 
 @dataclass(frozen=True, kw_only=True)
 class Weight:
-    """What ``Guard.weigh`` counted.
+    """The counts of ``Guard.weigh``.
 
     Attributes:
         numbers: numbers and elements of arrays and ranges.
@@ -291,7 +291,7 @@ def _children(container: list[Any] | tuple[Any, ...] | dict[Any, Any]) -> Iterab
     return [*container.keys(), *container.values()] if isinstance(container, dict) else container
 
 
-def _numbers_in(leaf: Any) -> int:
+def _numbers_in(leaf: object) -> int:
     if isinstance(leaf, np.ndarray):
         return leaf.size
     return len(leaf) if isinstance(leaf, range) else 1
@@ -310,11 +310,11 @@ _KINDS: dict[type, str] = {
 }
 
 
-def kind_of(value: Any) -> str:
-    """What a program calls this value: number, array, text, list, tuple, dictionary, range, observation, map, None.
+def kind_of(value: object) -> str:
+    """The kind of a value: number, array, text, list, tuple, dictionary, range, observation, map, None.
 
     Raises:
-        Refusal: no program may hold it.
+        Refusal: programs may not hold it.
     """
     kind = _KINDS.get(type(value))
     if kind is not None:
@@ -326,8 +326,8 @@ def kind_of(value: Any) -> str:
         if isinstance(value, of_host):
             return name
     if isinstance(value, DType):
-        raise Refusal("values", f"{value.name} is a type: it may stand for a dtype or be called, but is no value")
-    raise Refusal("values", f"{type(value).__name__} is no kind of value a program may hold")
+        raise Refusal("values", f"{value.name} is a type: it can be a dtype argument or be called, but is not a value")
+    raise Refusal("values", f"{type(value).__name__} is not a kind of value that a program may hold")
 
 
 def require_numbers(value: np.ndarray | np.generic) -> None:
@@ -336,7 +336,7 @@ def require_numbers(value: np.ndarray | np.generic) -> None:
         raise Refusal("values", f"an array of {value.dtype}; only truth values, integers and floats are allowed")
 
 
-def refuse_kind(value: Any, wanted: str) -> NoReturn:
+def refuse_kind(value: object, wanted: str) -> NoReturn:
     """Refuse a value where another kind is wanted."""
     raise Refusal("types", f"expected {wanted}, got {_article(kind_of(value))}")
 

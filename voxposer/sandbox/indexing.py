@@ -7,23 +7,23 @@ would select is counted before NumPy gets it: a few integers can ask for terabyt
 from __future__ import annotations
 
 import math
-import operator
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from voxposer.sandbox.guard import ELEMENTS_A_STEP, Guard, RecordList, Refusal, refuse_kind
-from voxposer.sandbox.values import APPENDED_BYTES, array, hashable, number_of, numbers
+from voxposer.sandbox.values import APPENDED_BYTES, array, hashable, integer, number_of, numbers
 
 
-def subscript(guard: Guard, value: Any, index: Any) -> Any:
+def subscript(guard: Guard, value: object, index: object) -> Any:
     """``value[index]``; see ``voxel_index`` for maps."""
     if isinstance(value, np.ndarray):
         place = _array_index(guard, value, index)
         return _seen(guard, value[place]) if _is_basic(place) else guard.take(value[place])
     if isinstance(value, dict):
         return value[hashable(guard, index)]
-    place = index if isinstance(index, slice) else operator.index(index)
+    place = index if isinstance(index, slice) else integer(index)
     if isinstance(value, RecordList):
         return guard.host("the list of observations", value.__getitem__, place)
     if isinstance(value, (list, tuple, str, range)):
@@ -31,13 +31,13 @@ def subscript(guard: Guard, value: Any, index: Any) -> Any:
     refuse_kind(value, "something to index")
 
 
-def _seen(guard: Guard, view: Any) -> Any:
+def _seen(guard: Guard, view: npt.ArrayLike) -> Any:
     """A part of an array that shares its memory."""
     guard.room((1,) * np.ndim(view))
     return view
 
 
-def assign(guard: Guard, value: Any, index: Any, item: Any) -> None:
+def assign(guard: Guard, value: object, index: object, item: object) -> None:
     """``value[index] = item``."""
     if isinstance(value, np.ndarray):
         place, content = _array_index(guard, value, index), numbers(guard, item)
@@ -49,18 +49,18 @@ def assign(guard: Guard, value: Any, index: Any, item: Any) -> None:
         guard.length(len(value))
         guard.hold(APPENDED_BYTES)
     elif isinstance(value, list) and not isinstance(index, slice):
-        value[operator.index(index)] = item
+        value[integer(index)] = item
     else:
         refuse_kind(value, "an array, a dictionary, or one place in a list, to assign to")
 
 
-def _is_basic(index: Any) -> bool:
+def _is_basic(index: object) -> bool:
     """Whether an index selects without copying."""
     parts = index if isinstance(index, tuple) else (index,)
     return not any(isinstance(part, np.ndarray) for part in parts)
 
 
-def _array_index(guard: Guard, value: np.ndarray, index: Any) -> Any:
+def _array_index(guard: Guard, value: np.ndarray, index: object) -> Any:
     """The index NumPy gets; refused if it would select more than an array may hold."""
     place = voxel_index(guard, value, index) if value.ndim >= 3 else _plain_index(guard, index)
     if not _is_basic(place):
@@ -68,7 +68,7 @@ def _array_index(guard: Guard, value: np.ndarray, index: Any) -> Any:
     return place
 
 
-def _plain_index(guard: Guard, index: Any) -> Any:
+def _plain_index(guard: Guard, index: object) -> Any:
     if isinstance(index, tuple):
         return tuple(_plain_index(guard, part) for part in index)
     return array(guard, index) if isinstance(index, list) else index
@@ -98,14 +98,14 @@ def _without_ellipsis(parts: tuple[Any, ...], dimensions: int) -> tuple[Any, ...
     return parts[:place] + (slice(None),) * missing + parts[place + 1 :]
 
 
-def _dimensions(part: Any) -> int:
+def _dimensions(part: object) -> int:
     """Dimensions of an array that a part of an index stands for."""
     if part is None:
         return 0
     return part.ndim if isinstance(part, np.ndarray) and part.dtype == bool else 1
 
 
-def voxel_index(guard: Guard, value: np.ndarray, index: Any) -> Any:
+def voxel_index(guard: Guard, value: np.ndarray, index: object) -> Any:
     """An index into a map (three or more dimensions) made to fit, as upstream's ``VoxelIndexingWrapper`` does.
 
     Fractions are rounded, what lies beyond the end becomes the last voxel, what is negative the first one (but -1 stays
@@ -113,19 +113,19 @@ def voxel_index(guard: Guard, value: np.ndarray, index: Any) -> Any:
     of coordinates is taken for a tuple of them. Arrays of truth values of the map's shape select as usual.
     """
     if isinstance(index, (list, np.ndarray)):
-        index = numbers(guard, index)
-        if index.dtype == bool:
-            return index
-        if index.ndim > 1:
+        places = numbers(guard, index)
+        if places.dtype == bool:
+            return places
+        if places.ndim > 1:
             raise Refusal("types", "a map takes x, y, z, slices or an array of truth values as its index")
-        index = tuple(index[None].ravel().tolist())
+        index = tuple(places[None].ravel().tolist())
     parts = index if isinstance(index, tuple) else (index,)
     lengths = iter(value.shape)
     parts = _without_ellipsis(parts, value.ndim)
     return tuple(None if part is None else _voxel(guard, part, next(lengths, 0)) for part in parts)
 
 
-def _voxel(guard: Guard, part: Any, length: int) -> Any:
+def _voxel(guard: Guard, part: object, length: int) -> Any:
     if isinstance(part, slice):
         return _voxel_slice(part)
     places = numbers(guard, part)

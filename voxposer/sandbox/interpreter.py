@@ -90,14 +90,14 @@ def parse(source: str, *, limits: Limits = Limits()) -> Program:  # noqa: B008  
 
 
 class _Jump(enum.Enum):
-    """How a statement ends other than by going on to the next."""
+    """How a statement ends, other than by continuing with the next."""
 
     BREAK = enum.auto()
     CONTINUE = enum.auto()
     RETURN = enum.auto()
 
 
-# What NumPy and Python raise at values that do not fit, and the rule it is told as.
+# What NumPy and Python raise at values that do not fit, and the rule that is reported.
 _FAILURES: tuple[tuple[tuple[type[Exception], ...], str], ...] = (
     ((MemoryError,), "memory"),
     ((RecursionError,), "nesting"),
@@ -174,7 +174,7 @@ class _Run:
         return None
 
     def _located(self, table: Mapping[type[ast.AST], Callable[[Any], Any]], node: ast.AST) -> Any:
-        """A node's value or effect; what goes wrong is told with its line, the innermost node's first."""
+        """A node's value or effect; an error is reported with the line of the innermost node that failed."""
         try:
             self._guard.budget.step()
             return table[type(node)](node)
@@ -184,7 +184,7 @@ class _Run:
             raise
         except _FAILURE_TYPES as error:
             rule = next(rule for kinds, rule in _FAILURES if isinstance(error, kinds))
-            raise self._error(node, rule, _told(error)) from None
+            raise self._error(node, rule, _message(error)) from None
 
     def _error(self, node: ast.AST, rule: str, reason: str) -> SandboxError:
         line = getattr(node, "lineno", 1)
@@ -198,8 +198,8 @@ class _Run:
         jumps = [self._store(target, value) for target in node.targets]
         return next((jump for jump in jumps if jump is not None), None)
 
-    def _store(self, target: ast.expr, value: Any) -> _Jump | None:
-        """Put a value in its place; tells if that is a return."""
+    def _store(self, target: ast.expr, value: object) -> _Jump | None:
+        """Assign a value to a target; the jump that this causes, if any."""
         if isinstance(target, ast.Name):
             return self._bind(target.id, value)
         if isinstance(target, (ast.Tuple, ast.List)):
@@ -209,7 +209,7 @@ class _Run:
         indexing.assign(self._guard, container, self._eval(target.slice), value)
         return None
 
-    def _bind(self, name: str, value: Any) -> _Jump | None:
+    def _bind(self, name: str, value: object) -> _Jump | None:
         if name in _MODULE_NAMES:
             raise Refusal("names", f"{name!r} cannot be assigned to: it is part of the language")
         kind_of(value)
@@ -219,7 +219,7 @@ class _Run:
             return _Jump.RETURN
         return None
 
-    def _unpack(self, targets: Sequence[ast.expr], value: Any) -> _Jump | None:
+    def _unpack(self, targets: Sequence[ast.expr], value: object) -> _Jump | None:
         items = values.iterate(self._guard, value)
         if len(items) != len(targets):
             raise Refusal("value", f"{len(items)} values for {len(targets)} names")
@@ -306,7 +306,7 @@ class _Run:
         is_numpy = isinstance(base, ast.Name) and base.id in _MODULE_NAMES
         return ".".join(reversed(names)) if is_numpy else None
 
-    def _field(self, record: Record, name: Any) -> Any:
+    def _field(self, record: Record, name: object) -> Any:
         if not isinstance(name, str) or name.startswith("_"):
             raise Refusal("attributes", f"an observation's fields are named; {name!r} is none of them")
         try:
@@ -327,7 +327,7 @@ class _Run:
     def _binary(self, node: ast.BinOp) -> Any:
         return self._arithmetic(SYMBOLS[type(node.op)], self._eval(node.left), self._eval(node.right))
 
-    def _arithmetic(self, symbol: str, left: Any, right: Any, in_place: bool = False) -> Any:
+    def _arithmetic(self, symbol: str, left: object, right: object, in_place: bool = False) -> Any:
         made = operators.arithmetic(self._guard, symbol, left, right, in_place)
         return made if made is left else self._guard.take(made)
 
@@ -400,7 +400,7 @@ class _Run:
         return function(*arguments, **named)
 
     def _function(self, node: ast.expr) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """The function to call, and what it gets before the arguments."""
+        """The function to call, and arguments to insert before the given ones."""
         if isinstance(node, ast.Name):
             return self._named_function(node.id), ()
         assert isinstance(node, ast.Attribute)
@@ -433,7 +433,7 @@ class _Run:
         return lambda *arguments, **named: self._guard.take_all(function(self._guard, *arguments, **named))
 
     def _of_host(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **named: Any) -> Any:
+        def call(*arguments: object, **named: object) -> Any:
             self._guard.weigh([*arguments, *named.values()])
             return self._guard.host(name, function, *arguments, **named)
 
@@ -453,7 +453,7 @@ def _numpy_value(dotted: str) -> float | DType | None:
     raise Refusal("names", f"np.{dotted} is not among the parts of NumPy that are allowed")
 
 
-def _told(error: Exception) -> str:
+def _message(error: Exception) -> str:
     text = str(error) or type(error).__name__
     return text if len(text) <= 200 else f"{text[:200]}..."
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 
@@ -33,7 +33,7 @@ def elementwise(name: str, arity: int) -> Function:
     """A function of NumPy that works element by element on ``arity`` operands."""
     function = getattr(np, name)
 
-    def apply(guard: Guard, *values: Any) -> Any:
+    def apply(guard: Guard, *values: object) -> Any:
         if len(values) != arity:
             raise Refusal("types", f"np.{name} takes {arity} argument{'s'[: arity > 1]}, got {len(values)}")
         operands = [numbers(guard, value) for value in values]
@@ -49,7 +49,7 @@ def reduction(name: str) -> Function:
     """A reduction of NumPy over all axes or one."""
     function = getattr(np, name)
 
-    def apply(guard: Guard, a: Any, axis: Any = None, keepdims: Any = None) -> Any:
+    def apply(guard: Guard, a: object, axis: object = None, keepdims: object = None) -> Any:
         values = numbers(guard, a)
         broadcast(guard, values)
         extra = {} if keepdims is None else {"keepdims": bool(keepdims)}
@@ -61,7 +61,7 @@ def reduction(name: str) -> Function:
 def filled(value: float) -> Function:
     """``np.zeros``, ``np.ones``: an array of one value."""
 
-    def apply(guard: Guard, shape: Any, dtype: Any = DTYPES["float"]) -> np.ndarray:
+    def apply(guard: Guard, shape: object, dtype: object = DTYPES["float"]) -> np.ndarray:
         lengths = shape_of(guard, shape)
         guard.room(lengths)
         return np.full(lengths, value, dtype_of(dtype))
@@ -72,7 +72,7 @@ def filled(value: float) -> Function:
 def filled_like(value: float) -> Function:
     """``np.zeros_like``, ``np.ones_like``: an array of one value, of the shape of another."""
 
-    def apply(guard: Guard, a: Any, dtype: Any = None) -> np.ndarray:
+    def apply(guard: Guard, a: object, dtype: object = None) -> np.ndarray:
         like = np.asarray(numbers(guard, a))
         guard.room(like.shape)
         return np.full(like.shape, value, like.dtype if dtype is None else dtype_of(dtype))
@@ -80,27 +80,27 @@ def filled_like(value: float) -> Function:
     return apply
 
 
-def full(guard: Guard, shape: Any, fill_value: Any, dtype: Any = None) -> np.ndarray:
+def full(guard: Guard, shape: object, fill_value: object, dtype: object = None) -> np.ndarray:
     """``np.full``."""
     lengths = shape_of(guard, shape)
     guard.room(lengths)
     return np.full(lengths, numbers(guard, fill_value), None if dtype is None else dtype_of(dtype))
 
 
-def full_like(guard: Guard, a: Any, fill_value: Any) -> np.ndarray:
+def full_like(guard: Guard, a: object, fill_value: object) -> np.ndarray:
     """``np.full_like``."""
     like = np.asarray(numbers(guard, a))
     guard.room(like.shape)
     return np.full(like.shape, numbers(guard, fill_value), like.dtype)
 
 
-def eye(guard: Guard, n: Any) -> np.ndarray:
+def eye(guard: Guard, n: object) -> np.ndarray:
     """``np.eye`` of one size."""
     guard.room((count_of(n), count_of(n)))
     return np.eye(count_of(n))
 
 
-def arange(guard: Guard, start: Any, stop: Any = None, step: Any = 1) -> np.ndarray:
+def arange(guard: Guard, start: object, stop: object = None, step: object = 1) -> np.ndarray:
     """``np.arange``."""
     first, last = (0, start) if stop is None else (start, stop)
     first, last, stride = (number_of(value) for value in (first, last, step))
@@ -110,28 +110,30 @@ def arange(guard: Guard, start: Any, stop: Any = None, step: Any = 1) -> np.ndar
     return np.arange(first, last, stride)
 
 
-def linspace(guard: Guard, start: Any, stop: Any, num: Any = 50, endpoint: Any = True) -> np.ndarray:
+def linspace(guard: Guard, start: object, stop: object, num: object = 50, endpoint: object = True) -> np.ndarray:
     """``np.linspace``."""
     ends = numbers(guard, start), numbers(guard, stop)
     guard.room((count_of(num), *np.broadcast_shapes(*(np.shape(end) for end in ends))))
     return np.linspace(*ends, count_of(num), endpoint=bool(endpoint))
 
 
-def indices(guard: Guard, dimensions: Any) -> np.ndarray:
+def indices(guard: Guard, dimensions: object) -> np.ndarray:
     """``np.indices``."""
     lengths = shape_of(guard, dimensions)
     guard.room((len(lengths), *lengths))
     return np.indices(lengths)
 
 
-def meshgrid(guard: Guard, *values: Any, indexing: Any = "xy") -> list[np.ndarray]:
+def meshgrid(guard: Guard, *values: object, indexing: Literal["xy", "ij"] = "xy") -> list[np.ndarray]:
     """``np.meshgrid``."""
     axes = [np.atleast_1d(numbers(guard, value)) for value in values]
     guard.room((len(axes), *(axis.size for axis in axes)))
     return list(np.meshgrid(*axes, indexing=indexing))
 
 
-def norm(guard: Guard, x: Any, ord: Any = None, axis: Any = None, keepdims: Any = False) -> Any:
+def norm(
+    guard: Guard, x: object, ord: float | None = None, axis: SupportsIndex | None = None, keepdims: object = False
+) -> Any:
     """``np.linalg.norm``; an order is for vectors only."""
     values = np.asarray(numbers(guard, x))
     if ord is not None and (kind_of(ord) != "number" or (values.ndim != 1 and not isinstance(axis, (int, np.integer)))):
@@ -140,14 +142,14 @@ def norm(guard: Guard, x: Any, ord: Any = None, axis: Any = None, keepdims: Any 
     return np.linalg.norm(values, ord=ord, axis=axis, keepdims=bool(keepdims))
 
 
-def cross(guard: Guard, a: Any, b: Any) -> np.ndarray:
+def cross(guard: Guard, a: object, b: object) -> np.ndarray:
     """``np.cross``."""
     left, right = numbers(guard, a), numbers(guard, b)
     broadcast(guard, left, right)
     return np.cross(left, right)
 
 
-def outer(guard: Guard, a: Any, b: Any) -> np.ndarray:
+def outer(guard: Guard, a: object, b: object) -> np.ndarray:
     """``np.outer``."""
     left, right = np.asarray(numbers(guard, a)), np.asarray(numbers(guard, b))
     guard.room((left.size, right.size))
@@ -158,7 +160,7 @@ def joining(name: str, with_axis: bool) -> Function:
     """``np.stack`` and the like, with or without an axis."""
     function = getattr(np, name)
 
-    def apply(guard: Guard, arrays: Any, **options: Any) -> np.ndarray:
+    def apply(guard: Guard, arrays: object, **options: object) -> np.ndarray:
         if not set(options) <= ({"axis"} if with_axis else set()):
             raise Refusal("types", f"np.{name} takes arrays{' and axis' if with_axis else ''}")
         parts = [numbers(guard, part) for part in listed(guard, arrays)]
@@ -170,7 +172,7 @@ def joining(name: str, with_axis: bool) -> Function:
     return lambda guard, arrays, axis=0: apply(guard, arrays, axis=axis)
 
 
-def where(guard: Guard, condition: Any, *values: Any) -> Any:
+def where(guard: Guard, condition: object, *values: object) -> Any:
     """``np.where``, with a condition alone or with two values."""
     if not values:
         return positions("nonzero")(guard, condition)
@@ -185,7 +187,7 @@ def positions(name: str) -> Function:
     """nonzero or argwhere: as many integers as the array has dimensions, for each element at most."""
     function = getattr(np, name)
 
-    def apply(guard: Guard, a: Any) -> Any:
+    def apply(guard: Guard, a: object) -> Any:
         values = np.atleast_1d(numbers(guard, a))
         guard.room((int(np.count_nonzero(values)), values.ndim))
         return function(values)
@@ -193,7 +195,7 @@ def positions(name: str) -> Function:
     return apply
 
 
-def clip(guard: Guard, a: Any, a_min: Any = None, a_max: Any = None) -> Any:
+def clip(guard: Guard, a: object, a_min: object = None, a_max: object = None) -> Any:
     """``np.clip``."""
     ends = [None if end is None else numbers(guard, end) for end in (a_min, a_max)]
     values = numbers(guard, a)
@@ -201,14 +203,14 @@ def clip(guard: Guard, a: Any, a_min: Any = None, a_max: Any = None) -> Any:
     return np.clip(values, *ends)
 
 
-def round_array(guard: Guard, a: Any, decimals: Any = 0) -> Any:
+def round_array(guard: Guard, a: object, decimals: object = 0) -> Any:
     """``np.round``."""
     values = numbers(guard, a)
     broadcast(guard, values)
     return np.round(np.asarray(values), digits_of(decimals))[()]
 
 
-def unravel_index(guard: Guard, index: Any, shape: Any) -> tuple[Any, ...]:
+def unravel_index(guard: Guard, index: object, shape: object) -> tuple[Any, ...]:
     """``np.unravel_index``."""
     places = numbers(guard, index)
     lengths = shape_of(guard, shape)
@@ -220,7 +222,7 @@ def closeness(name: str) -> Function:
     """``np.allclose`` or ``np.isclose``."""
     function = getattr(np, name)
 
-    def apply(guard: Guard, a: Any, b: Any, rtol: Any = 1e-5, atol: Any = 1e-8) -> Any:
+    def apply(guard: Guard, a: object, b: object, rtol: object = 1e-5, atol: object = 1e-8) -> Any:
         left, right = numbers(guard, a), numbers(guard, b)
         broadcast(guard, left, right)
         return function(left, right, rtol=number_of(rtol), atol=number_of(atol))
@@ -228,7 +230,7 @@ def closeness(name: str) -> Function:
     return apply
 
 
-def array_equal(guard: Guard, a: Any, b: Any) -> bool:
+def array_equal(guard: Guard, a: object, b: object) -> bool:
     """``np.array_equal``."""
     left, right = np.asarray(numbers(guard, a)), np.asarray(numbers(guard, b))
     guard.room((max(left.size, right.size),))
@@ -239,7 +241,7 @@ def rearranging(name: str, *parameters: str) -> Function:
     """A function of one array that moves its elements, with parameters that are numbers or tuples of them."""
     function = getattr(np, name)
 
-    def apply(guard: Guard, a: Any, *values: Any, **named: Any) -> Any:
+    def apply(guard: Guard, a: object, *values: object, **named: object) -> Any:
         options = dict(zip(parameters, values, strict=False)) | named
         if len(values) > len(parameters) or not set(options) <= set(parameters):
             raise Refusal("types", f"np.{name} takes an array and {', '.join(parameters)}")
@@ -250,7 +252,7 @@ def rearranging(name: str, *parameters: str) -> Function:
     return apply
 
 
-def reshape(guard: Guard, a: Any, *shape: Any) -> np.ndarray:
+def reshape(guard: Guard, a: object, *shape: object) -> np.ndarray:
     """``np.reshape``."""
     lengths = shape_of(guard, shape[0] if len(shape) == 1 else shape)
     values = np.asarray(numbers(guard, a))
@@ -258,21 +260,21 @@ def reshape(guard: Guard, a: Any, *shape: Any) -> np.ndarray:
     return values.reshape(lengths)
 
 
-def interp(guard: Guard, x: Any, xp: Any, fp: Any) -> Any:
+def interp(guard: Guard, x: object, xp: object, fp: object) -> Any:
     """``np.interp``."""
     places, knots, values = (numbers(guard, value) for value in (x, xp, fp))
     broadcast(guard, places)
     return np.interp(places, knots, values)
 
 
-def diff(guard: Guard, a: Any, axis: Any = -1) -> np.ndarray:
+def diff(guard: Guard, a: object, axis: SupportsIndex = -1) -> np.ndarray:
     """``np.diff``."""
     values = numbers(guard, a)
     broadcast(guard, values)
     return np.diff(values, axis=axis)
 
 
-def copy_array(guard: Guard, a: Any) -> np.ndarray:
+def copy_array(guard: Guard, a: object) -> np.ndarray:
     """``np.copy``."""
     values = np.asarray(numbers(guard, a))
     guard.room(values.shape, values.itemsize)

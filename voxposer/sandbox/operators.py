@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 
 from voxposer.sandbox.guard import Guard, Refusal, kind_of, refuse_kind
-from voxposer.sandbox.values import APPENDED_BYTES, broadcast, numbers, require_power, truth
+from voxposer.sandbox.values import APPENDED_BYTES, broadcast, number_of, numbers, require_power, truth
 
 # Multiplications of a matrix product that a program may ask for.
 _MULTIPLICATIONS = 10**8
+_SEQUENCES = (str, list, tuple)
 
 
-def arithmetic(guard: Guard, symbol: str, left: Any, right: Any, in_place: bool = False) -> Any:
+def arithmetic(guard: Guard, symbol: str, left: object, right: object, in_place: bool = False) -> Any:
     """``left symbol right``; in place it changes arrays and lists as Python does.
 
     Raises:
@@ -28,53 +29,49 @@ def arithmetic(guard: Guard, symbol: str, left: Any, right: Any, in_place: bool 
     """
     if (_numeric(left) and _numeric(right)) or _mixed(left, right):
         return _numeric_operation(guard, symbol, left, right, in_place)
-    if symbol == "+" and _same_sequence(left, right):
+    if symbol == "+" and isinstance(left, _SEQUENCES) and isinstance(right, _SEQUENCES) and type(left) is type(right):
         _require_length(guard, left, len(left) + len(right))
         guard.hold(len(right) * APPENDED_BYTES)
-        return (operator.iadd if in_place else operator.add)(left, right)
+        return (_IN_PLACE if in_place else _OPERATORS)[symbol](left, right)
     if symbol == "*":
         return _repeated(guard, left, right)
     raise Refusal("types", f"{kind_of(left)} {symbol} {kind_of(right)}")
 
 
-def _numeric(value: Any) -> bool:
+def _numeric(value: object) -> bool:
     return kind_of(value) in ("number", "array")
 
 
-def _mixed(left: Any, right: Any) -> bool:
+def _mixed(left: object, right: object) -> bool:
     """Whether one is an array and the other a list that NumPy would make one."""
     kinds = {kind_of(left), kind_of(right)}
     return "array" in kinds and bool(kinds & {"list", "tuple"})
 
 
-def _same_sequence(left: Any, right: Any) -> bool:
-    return type(left) is type(right) and isinstance(left, (str, list, tuple))
-
-
-def _require_length(guard: Guard, like: Any, length: int) -> None:
+def _require_length(guard: Guard, like: object, length: int) -> None:
     if isinstance(like, str):
         guard.characters(length)
     else:
         guard.length(length)
 
 
-def _repeated(guard: Guard, left: Any, right: Any) -> Any:
-    sequence, times = (left, right) if isinstance(left, (str, list, tuple)) else (right, left)
-    if not isinstance(sequence, (str, list, tuple)) or not isinstance(times, (int, np.integer)):
+def _repeated(guard: Guard, left: object, right: object) -> Any:
+    sequence, times = (left, right) if isinstance(left, _SEQUENCES) else (right, left)
+    if not isinstance(sequence, _SEQUENCES) or not isinstance(times, (int, np.integer)):
         raise Refusal("types", f"{kind_of(left)} * {kind_of(right)}")
     _require_length(guard, sequence, len(sequence) * max(int(times), 0))
     return sequence * int(times)
 
 
-def _numeric_operation(guard: Guard, symbol: str, left: Any, right: Any, in_place: bool) -> Any:
-    left, right = numbers(guard, left), numbers(guard, right)
+def _numeric_operation(guard: Guard, symbol: str, left: object, right: object, in_place: bool) -> Any:
+    a, b = numbers(guard, left), numbers(guard, right)
     if symbol == "@":
-        return dot(guard, left, right)
+        return dot(guard, a, b)
     if symbol == "**":
-        require_power(guard, left, right)
-    broadcast(guard, left, right)
-    table = _IN_PLACE if in_place and isinstance(left, np.ndarray) else _OPERATORS
-    return table[symbol](left, right)
+        require_power(guard, a, b)
+    broadcast(guard, a, b)
+    table = _IN_PLACE if in_place and isinstance(a, np.ndarray) else _OPERATORS
+    return table[symbol](a, b)
 
 
 _OPERATORS: dict[str, Callable[..., Any]] = {
@@ -113,7 +110,7 @@ _COMPARISONS: dict[str, Callable[..., Any]] = {
 }
 
 
-def compare(guard: Guard, symbol: str, left: Any, right: Any) -> Any:
+def compare(guard: Guard, symbol: str, left: object, right: object) -> Any:
     """``left symbol right``: element by element for arrays."""
     guard.weigh(left)
     guard.weigh(right)
@@ -124,43 +121,41 @@ def compare(guard: Guard, symbol: str, left: Any, right: Any) -> Any:
     if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
         if left is None or right is None:
             return symbol == "!="
-        left, right = numbers(guard, left), numbers(guard, right)
-        broadcast(guard, left, right)
+        a, b = numbers(guard, left), numbers(guard, right)
+        broadcast(guard, a, b)
+        return _COMPARISONS[symbol](a, b)
     return _COMPARISONS[symbol](left, right)
 
 
-def _contains(guard: Guard, container: Any, item: Any) -> bool:
+def _contains(guard: Guard, container: object, item: object) -> bool:
     if isinstance(container, str) and isinstance(item, str):
         return item in container
     if isinstance(container, range):  # which walks through all of it for anything but an int
-        return _is_whole(item) and int(item) in container
+        number = number_of(item) if kind_of(item) == "number" else math.nan
+        return math.isfinite(number) and number == int(number) and int(number) in container
     if isinstance(container, (list, tuple, dict)):
         return item in container
     refuse_kind(container, "a list, a dictionary or text")
 
 
-def _is_whole(value: Any) -> bool:
-    return kind_of(value) == "number" and math.isfinite(value) and value == int(value)
-
-
-def unary(guard: Guard, symbol: str, value: Any) -> Any:
+def unary(guard: Guard, symbol: str, value: object) -> Any:
     """``-value``, ``+value``, ``~value`` or ``not value``."""
     if symbol == "not":
         return not truth(guard, value)
-    value = numbers(guard, value) if _numeric(value) else refuse_kind(value, "numbers")
-    broadcast(guard, value)
+    operand = numbers(guard, value) if _numeric(value) else refuse_kind(value, "numbers")
+    broadcast(guard, operand)
     if symbol == "~":
-        return np.invert(value) if isinstance(value, (np.ndarray, np.generic)) else _inverted(value)
-    return -value if symbol == "-" else +value
+        return np.invert(operand) if isinstance(operand, (np.ndarray, np.generic)) else _inverted(operand)
+    return -operand if symbol == "-" else +operand
 
 
-def _inverted(value: Any) -> int:
+def _inverted(value: int) -> int:
     if isinstance(value, bool):
         raise Refusal("types", "~ of a truth value; write not")
     return ~value
 
 
-def dot(guard: Guard, a: Any, b: Any) -> Any:
+def dot(guard: Guard, a: object, b: object) -> Any:
     """``np.dot`` of numbers, vectors or matrices."""
     left, right = np.asarray(numbers(guard, a)), np.asarray(numbers(guard, b))
     if left.ndim > 2 or right.ndim > 2:

@@ -191,7 +191,7 @@ def _require_public(name: str) -> None:
 def _check_constant(node: ast.Constant) -> None:
     value = node.value
     if value is not Ellipsis and not isinstance(value, (str, bool, int, float, type(None))):
-        raise Refusal("values", f"{type(value).__name__} is no kind of value a program may hold")
+        raise Refusal("values", f"{type(value).__name__} is not a kind of value that a program may hold")
     if isinstance(value, str) and any("\ud800" <= character <= "\udfff" or character == "\0" for character in value):
         raise Refusal("values", "text with characters that no encoding has")
 

@@ -10,9 +10,10 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, SupportsIndex, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from voxposer.sandbox.guard import (
     DType,
@@ -28,7 +29,7 @@ from voxposer.sandbox.guard import (
 
 # Numbers in one piece of text.
 _PRINTED = 1000
-# Digits that round() may be asked for.
+# Largest number of digits for round().
 _DIGITS = 20
 # Bytes counted for an item put into a list.
 APPENDED_BYTES = 16
@@ -50,7 +51,7 @@ DTYPES: Mapping[str, DType] = MappingProxyType(
 )
 
 
-def numbers(guard: Guard, value: Any) -> Any:
+def numbers(guard: Guard, value: object) -> Any:
     """A number or array as it is; a list of numbers as an array."""
     kind = kind_of(value)
     if kind in ("list", "tuple", "range"):
@@ -58,12 +59,12 @@ def numbers(guard: Guard, value: Any) -> Any:
     return value if kind in ("number", "array") else refuse_kind(value, "numbers")
 
 
-def broadcast(guard: Guard, *values: Any) -> None:
+def broadcast(guard: Guard, *values: npt.ArrayLike) -> None:
     """Refuse an operation whose result would be too large."""
     guard.room(np.broadcast_shapes(*(np.shape(value) for value in values)))
 
 
-def array(guard: Guard, value: Any, dtype: DType | None = None) -> np.ndarray:
+def array(guard: Guard, value: object, dtype: DType | None = None) -> np.ndarray:
     """``np.array`` of numbers, lists of them or arrays."""
     if kind_of(value) not in ("number", "array", "list", "tuple", "range"):
         refuse_kind(value, "numbers")
@@ -76,47 +77,56 @@ def array(guard: Guard, value: Any, dtype: DType | None = None) -> np.ndarray:
     return made if dtype is None else made.astype(dtype_of(dtype))
 
 
-def dtype_of(dtype: Any) -> type[np.generic]:
+def dtype_of(dtype: object) -> type[np.generic]:
     """The number type that a program named."""
     if not isinstance(dtype, DType):
         raise Refusal("types", f"a dtype is one of {', '.join(DTYPES)}")
     return dtype.dtype
 
 
-def shape_of(guard: Guard, shape: Any) -> tuple[int, ...]:
+def shape_of(guard: Guard, shape: object) -> tuple[int, ...]:
     """A shape given as an integer, a list or a tuple."""
     lengths = shape if isinstance(shape, (tuple, list)) else (shape,)
-    return tuple(operator.index(length) for length in lengths)
+    return tuple(integer(length) for length in lengths)
 
 
-def count_of(value: Any) -> int:
-    """A number of things that is asked for."""
-    return max(operator.index(value), 0)
+def integer(value: object) -> int:
+    """``operator.index(value)``.
+
+    Raises:
+        TypeError: the value is not an integer.
+    """
+    return operator.index(cast(SupportsIndex, value))
 
 
-def number_of(value: Any) -> int | float:
+def count_of(value: object) -> int:
+    """A requested count, at least 0."""
+    return max(integer(value), 0)
+
+
+def number_of(value: object) -> int | float:
     """A number as Python's own."""
     if kind_of(value) != "number":
         refuse_kind(value, "a number")
-    return value.item() if isinstance(value, np.generic) else value
+    return value.item() if isinstance(value, np.generic) else cast(float, value)
 
 
-def digits_of(value: Any) -> int:
+def digits_of(value: object) -> int:
     """A number of digits, within bounds."""
-    digits = operator.index(value)
+    digits = integer(value)
     if abs(digits) > _DIGITS:
         raise Refusal("size", f"rounding to {digits} digits; {_DIGITS} are allowed")
     return digits
 
 
-def require_power(guard: Guard, base: Any, exponent: Any) -> None:
+def require_power(guard: Guard, base: object, exponent: object) -> None:
     """Refuse a power of integers that would be too large."""
     if isinstance(base, int) and isinstance(exponent, int) and exponent > 0 and abs(base) > 1:
         guard.bits(int(exponent * math.log2(abs(base))))
 
 
-def truth(guard: Guard, value: Any) -> bool:
-    """What ``if value:`` goes by.
+def truth(guard: Guard, value: object) -> bool:
+    """The truth value of ``if value:``.
 
     Raises:
         Refusal: it is an array of several elements.
@@ -128,7 +138,7 @@ def truth(guard: Guard, value: Any) -> bool:
     return True if isinstance(value, (Record, Opaque)) else bool(value)
 
 
-def hashable(guard: Guard, key: Any) -> Any:
+def hashable(guard: Guard, key: object) -> Any:
     """A dictionary key: text, a number, None, or a tuple of them."""
     guard.weigh(key)
     if not isinstance(key, tuple) and kind_of(key) not in ("text", "number", "None"):
@@ -136,7 +146,7 @@ def hashable(guard: Guard, key: Any) -> Any:
     return key
 
 
-def iterate(guard: Guard, value: Any) -> Sequence[Any]:
+def iterate(guard: Guard, value: object) -> Sequence[Any]:
     """What a loop over the value runs through; ranges, lists and arrays as they are.
 
     Raises:
@@ -153,14 +163,14 @@ def iterate(guard: Guard, value: Any) -> Sequence[Any]:
     refuse_kind(value, "something to loop over")
 
 
-def listed(guard: Guard, value: Any) -> list[Any]:
+def listed(guard: Guard, value: object) -> list[Any]:
     """The items of a value as a new list."""
     items = iterate(guard, value)
     guard.length(len(items))
     return list(items)
 
 
-def length_of(guard: Guard, value: Any) -> int:
+def length_of(guard: Guard, value: object) -> int:
     """``len(value)``."""
     if isinstance(value, RecordList):
         return guard.host("the list of observations", len, value)
@@ -169,7 +179,7 @@ def length_of(guard: Guard, value: Any) -> int:
     refuse_kind(value, "something with a length")
 
 
-def text(guard: Guard, value: Any, spec: str = "") -> str:
+def text(guard: Guard, value: object, spec: str = "") -> str:
     """``str(value)``, or a number in a format such as ``.2f``; NumPy's numbers look like Python's.
 
     Raises:
@@ -189,8 +199,8 @@ def text(guard: Guard, value: Any, spec: str = "") -> str:
     return made
 
 
-def _plain(guard: Guard, value: Any) -> Any:
-    """A value whose ``str`` says no more than a program may know, and the same each time."""
+def _plain(guard: Guard, value: object) -> Any:
+    """A value whose ``str`` reveals no more than a program may know, and is the same each time."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, (list, tuple)):

@@ -102,7 +102,7 @@ BUILTINS: Mapping[str, Function] = MappingProxyType(
 )
 
 
-def _transposed(guard: Guard, value: Any, *axes: Any) -> Any:
+def _transposed(guard: Guard, value: object, *axes: object) -> Any:
     """``array.transpose``, which takes its axes one by one."""
     return NUMPY["transpose"](guard, value, axes or None)
 

@@ -23,6 +23,7 @@ from vecenv_eval.config import ConfigError, EvalConfig, option_name, read_settin
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from vecenv_eval.campaign import Campaign, Leg
     from vecenv_eval.results import EvalResult, Progress
     from vecenv_eval.runner import Evaluation
     from vecenv_eval.store import ResultStore
@@ -44,25 +45,48 @@ def eval_command(
     **settings: Any,
 ) -> None:
     """Evaluate a policy on a suite: success rates with Wilson 95 % intervals."""
+    from vecenv_eval.campaign import CAMPAIGN, Campaign, is_campaign
+
     given = given_settings(settings)
     sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
     with _user_errors():
-        evaluation, store = _resume(resume, given, config, out) if resume else _start(given, config, out)
-    raise typer.Exit(_run(evaluation, store, quiet))
+        if resume is not None and (resume / CAMPAIGN).exists():
+            _refuse_settings(resume, given, config, out)
+            status = _run_campaign(Campaign.open(resume), quiet)
+        elif resume is not None:
+            status = _run(*_resume(resume, given, config, out), quiet)
+        else:
+            wanted = _wanted(given, config)
+            folder = out or _default_folder(wanted)
+            status = (
+                _run_campaign(Campaign(wanted, folder), quiet)
+                if is_campaign(wanted)
+                else _run_new(wanted, folder, quiet)
+            )
+    raise typer.Exit(status)
 
 
-def _start(given: dict[str, Any], file: Path | None, out: Path | None) -> tuple[Evaluation, ResultStore]:
-    """A new evaluation; no folder is made before the settings were checked."""
-    from vecenv_eval.results import begin
-    from vecenv_eval.runner import Evaluation
-    from vecenv_eval.store import RESULTS, default_folder
-
+def _wanted(given: dict[str, Any], file: Path | None) -> EvalConfig:
+    """The config of options and file."""
     given = {**(read_settings(file) if file else {}), **given}
     if not given.get("suite"):
         fail("--suite is needed; `vecenv list` names the suites (or --resume continues a results folder)")
-    config = EvalConfig.from_dict(given)
+    return EvalConfig.from_dict(given)
+
+
+def _default_folder(config: EvalConfig) -> Path:
+    from vecenv_eval.store import RESULTS, default_folder
+
+    return default_folder(RESULTS, "+".join(config.suites), config.policy_name)
+
+
+def _run_new(config: EvalConfig, folder: Path, quiet: bool) -> int:
+    """A new evaluation; no folder is made before the settings were checked."""
+    from vecenv_eval.results import begin
+    from vecenv_eval.runner import Evaluation
+
     evaluation = Evaluation(config)
-    return evaluation, begin(config, out or default_folder(RESULTS, config.suite, config.policy_name))
+    return _run(evaluation, begin(config, folder), quiet)
 
 
 def _resume(folder: Path, given: dict[str, Any], file: Path | None, out: Path | None) -> tuple[Evaluation, ResultStore]:
@@ -70,14 +94,51 @@ def _resume(folder: Path, given: dict[str, Any], file: Path | None, out: Path | 
     from vecenv_eval.results import resume
     from vecenv_eval.runner import Evaluation
 
+    _refuse_settings(folder, given, file, out, but_resumable=True)
+    config, store = resume(folder, **given)
+    return Evaluation(config), store
+
+
+def _refuse_settings(
+    folder: Path, given: dict[str, Any], file: Path | None, out: Path | None, but_resumable: bool = False
+) -> None:
+    """Refuse settings that the folder holds already."""
     refused = [
-        *(option_name(each) for each in fields(EvalConfig) if each.name in given and not setting(each).resumable),
+        *(
+            option_name(each)
+            for each in fields(EvalConfig)
+            if each.name in given and not (but_resumable and setting(each).resumable)
+        ),
         *(name for name, value in (("--config", file), ("--out", out)) if value),
     ]
     if refused:
         fail(f"--resume keeps the settings of {folder}: leave out {', '.join(refused)}")
-    config, store = resume(folder, **given)
-    return Evaluation(config), store
+
+
+def _run_campaign(campaign: Campaign, quiet: bool) -> int:
+    """Run several suites or seeds and print; returns the exit status."""
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    from vecenv_eval.campaign import markdown
+
+    console = Console(quiet=quiet)
+    with _progress(console) as on_progress:
+
+        def report(leg: Leg, progress: Progress) -> None:
+            on_progress(progress)
+
+        def finished(leg: Leg, result: EvalResult) -> None:
+            seed = "" if leg.seed is None else f", seed {leg.seed}"
+            console.print(f"[bold]{leg.suite}[/bold]{seed}")
+            _print_result(console, result)
+
+        summary, results = campaign.run(report, finished)
+    console.print(Markdown(markdown(summary)))
+    typer.echo(campaign.folder)
+    if any(result.interrupted for result in results):
+        return 130
+    return 0 if len(results) == len(campaign.legs) and all(result.ok for result in results) else 1
 
 
 @contextmanager

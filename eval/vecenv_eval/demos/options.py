@@ -1,10 +1,10 @@
-"""The arguments of ``vecenv.make`` that a recording holds, so that a replay begins and goes as the recording did."""
+"""The options of ``vecenv.make`` that a recording holds, so that a replay repeats the recorded episode."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 import vecenv
@@ -34,16 +34,23 @@ _KINDS = {
 
 def make_options(make: Callable[..., BatchEnv], **arguments: Any) -> dict[str, Any]:
     """The options under which ``make(**arguments)`` runs episodes, those of the protocol and defaults included."""
-    signature = inspect.signature(make)
-    bound = signature.bind_partial(**arguments)
-    bound.apply_defaults()
-    given = {name: value for name, value in bound.arguments.items() if value is not None}
+    known = _defaults(make)
+    given = {name: value for name, value in {**known, **arguments}.items() if value is not None}
     chosen = protocols.protocol(given.get("protocol", protocols.DEFAULT))
     options = {**chosen.options(given.get("suite", "")), **given}
     options["reset_loop"] = asdict(protocols.reset_loop(options["reset_loop"]))
     if options["fixtures"] != "upstream":
         del options["reset_loop"]
-    return {name: value for name, value in options.items() if name in _OPTIONS & signature.parameters.keys()}
+    return {name: value for name, value in options.items() if name in _OPTIONS & known.keys()}
+
+
+def _defaults(make: Callable[..., BatchEnv]) -> dict[str, Any]:
+    """Options of ``make`` with their defaults: its own, and the fields of ``LiberoConfig`` where it takes any."""
+    parameters = inspect.signature(make).parameters.values()
+    found = {each.name: each.default for each in parameters if each.default is not each.empty}
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        found |= {each.name: each.default for each in fields(vecenv.LiberoConfig)}
+    return found
 
 
 def check_options(options: Mapping[str, Any]) -> None:
@@ -52,12 +59,12 @@ def check_options(options: Mapping[str, Any]) -> None:
     Raises:
         DemoError: an option is not among those that a recording holds, or has the wrong type.
     """
-    parameters = inspect.signature(vecenv.make).parameters
-    known = parameters.keys() & _OPTIONS
+    defaults = _defaults(vecenv.make)
+    known = defaults.keys() & _OPTIONS
     for option, value in options.items():
         if option not in known:
             raise DemoError(f"attribute make: {option!r:.50} is none of {', '.join(sorted(known))}")
-        _check_option(option, value, parameters[option].default)
+        _check_option(option, value, defaults[option])
 
 
 def _check_option(name: str, value: object, default: object) -> None:

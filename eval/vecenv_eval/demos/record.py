@@ -41,13 +41,13 @@ class Recorder:
     ) -> None:
         if not (hasattr(env, "watched") and hasattr(env, "state")):
             raise RecordError(f"{type(env).__name__} does not show the actions it executes, so it cannot be recorded")
-        self._env: Any = env
-        self._episodes, self._options = episodes, options
-        self._actions: list[np.ndarray] = []
-        self._moved: list[np.ndarray] = []
-        self._states: list[list[np.ndarray]] | None = [[] for _ in episodes] if states else None
-        state = self._env.state()
-        self._start = [flat_state(state, slot) for slot in range(len(episodes))]
+        self._env, self._options, self._with_states = env, options, states
+        self._episodes = list(episodes)
+        count = len(self._episodes)
+        self._actions: list[list[np.ndarray]] = [[] for _ in range(count)]
+        self._states: list[list[np.ndarray]] = [[] for _ in range(count)]
+        state = env.state()
+        self._start = [flat_state(state, slot) for slot in range(count)]
         self._ended: dict[int, tuple[bool, str, np.ndarray]] = {}
 
     @contextmanager
@@ -57,12 +57,19 @@ class Recorder:
             yield
 
     def _note(self, actions: np.ndarray, active: np.ndarray) -> None:
-        self._actions.append(np.array(actions, float))
-        self._moved.append(np.array(active, bool))
-        if self._states is not None:
-            state = self._env.state()
-            for slot in np.flatnonzero(active).tolist():
+        state = self._env.state() if self._with_states else None
+        for slot in np.flatnonzero(active).tolist():
+            self._actions[slot].append(np.array(actions[slot], float))
+            if state is not None:
                 self._states[slot].append(flat_state(state, slot))
+
+    def begin(self, slots: Sequence[int], episodes: Sequence[int]) -> None:
+        """Other episodes have begun in some slots, which were just reset; what they had recorded is dropped."""
+        state = self._env.state()
+        for slot, episode in zip(slots, episodes, strict=True):
+            self._episodes[slot], self._start[slot] = episode, flat_state(state, slot)
+            self._actions[slot], self._states[slot] = [], []
+            self._ended.pop(slot, None)
 
     def finish(self, finished: np.ndarray, success: np.ndarray, faults: Sequence[str]) -> None:
         """Note the verdicts of the slots that the last call finished: bool [B], bool [B], B strings."""
@@ -71,24 +78,27 @@ class Recorder:
             self._ended[slot] = (bool(success[slot]), faults[slot], flat_state(state, slot))
 
     def recordings(self) -> dict[int, Recording]:
-        """The finished slots; one whose physics failed before its first tick has nothing to record."""
-        if not self._actions:
-            return {}
-        actions, moved = np.stack(self._actions), np.stack(self._moved)
+        """The slots that have finished; one whose physics failed before its first tick has nothing to record."""
         return {
             slot: Recording(
                 episode=self._episodes[slot],
                 success=success,
                 fault=fault,
-                actions=actions[moved[:, slot], slot],
+                actions=np.stack(self._actions[slot]),
                 init_state=self._start[slot],
                 final_state=final,
-                states=None if self._states is None else np.array(self._states[slot]),
+                states=np.array(self._states[slot]) if self._with_states else None,
                 options=_of_slot(self._options, slot),
             )
             for slot, (success, fault, final) in self._ended.items()
-            if moved[:, slot].any()
+            if self._actions[slot]
         }
+
+    def take(self) -> dict[int, Recording]:
+        """``recordings``, which are then forgotten."""
+        taken = self.recordings()
+        self._ended.clear()
+        return taken
 
 
 def flat_state(state: State, slot: int) -> np.ndarray:

@@ -18,9 +18,13 @@ from vecenv.contract import BatchEnv, Control, ResetInfo
 from vecenv.errors import InvalidInput
 
 BUILTIN = {
+    "gr00t": "vecenv_eval.clients.gr00t:Gr00tPolicy",
+    "openpi": "vecenv_eval.clients.openpi:OpenPiPolicy",
     "pick_place": "vecenv_eval.policies.pick_place.policy:PickPlacePolicy",
     "random": "vecenv_eval.policies.random:RandomPolicy",
     "simpler_scripted": "vecenv_eval.policies.simpler.policy:SimplerScriptedPolicy",
+    "starvla": "vecenv_eval.clients.starvla:StarVLAPolicy",
+    "vla-eval": "vecenv_eval.clients.vla_eval:VlaEvalPolicy",
     "voxposer": "vecenv_eval.policies.voxposer:VoxPoserPolicy",
     "zero": "vecenv_eval.policies.scripted:ZeroPolicy",
 }
@@ -79,6 +83,15 @@ class Refillable(Protocol):
             info: what its reset returned, for all slots.
             slots: indices of the slots that begin, ascending.
         """
+        ...
+
+
+@runtime_checkable
+class Closing(Protocol):
+    """A policy that holds connections or files; optional."""
+
+    def close(self) -> None:
+        """Release them; called when the run ends, however it ends."""
         ...
 
 

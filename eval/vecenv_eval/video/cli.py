@@ -10,7 +10,7 @@ from pathlib import Path
 
 import typer
 
-from vecenv_eval.video.episodes import LOD, MAX_STEPS, SIZE, make_env, record_rollout
+from vecenv_eval.video import LOD, MAX_STEPS, SIZE
 
 
 def video_command(
@@ -36,11 +36,12 @@ def video_command(
 ) -> None:
     """Record a policy: all episodes of a batch in one mp4, titled, framed by verdict."""
     from vecenv.cli import fail
-    from vecenv.contract import ImagesUnavailable
     from vecenv.libero.render.gl import GlError
     from vecenv.libero.render.options import RenderError
+    from vecenv.observations import ImagesUnavailable
     from vecenv_eval.policies import PolicyError, make_policy
     from vecenv_eval.runner import default_policy
+    from vecenv_eval.video.episodes import make_env, record_rollout
 
     options = {"max_steps": max_steps, "size": size, "lod": lod}
     try:

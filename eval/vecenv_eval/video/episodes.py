@@ -15,10 +15,8 @@ import vecenv
 from vecenv.contract import BatchEnv, Control
 from vecenv.libero.render.options import RenderConfig
 from vecenv_eval.policies import Policy
+from vecenv_eval.video import LOD, MAX_STEPS, SIZE
 from vecenv_eval.video.writer import CONTROL_HZ, Recordable, recording
-
-# The options of LIBERO's videos unless others are given.
-SIZE, LOD, MAX_STEPS = 256, "exact", 400
 
 
 class RecordableEnv(BatchEnv, Recordable, Protocol):

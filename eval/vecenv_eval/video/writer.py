@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from vecenv.contract import Egocentric, Metrics, Rendered, ResetInfo
+from vecenv.contract import Metrics, ResetInfo
 from vecenv.libero.render.options import RenderError
+from vecenv.observations import Egocentric, Rendered
 from vecenv_eval.video.grid import render_grid
 
 if TYPE_CHECKING:

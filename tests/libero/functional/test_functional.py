@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from typing import Any
 
@@ -26,6 +26,10 @@ from vecenv.libero.functional import (
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.mjx.options import compiler_options
 from vecenv.libero.tasks.suites import UnknownTask
+
+# Arrays of different rank do not broadcast, neither in our functions nor in MJX on MuJoCo Warp. MJX's pure JAX promotes
+# ranks itself, so tests that step with it use `rank_promotion`.
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 
 WORLDS = 2
 # What vecenv.libero.physics.budgets measures for libero_object task 0.
@@ -69,6 +73,12 @@ class Compiled:
 @pytest.fixture(scope="module")
 def plain() -> Compiled:
     return Compiled(made(reward="shaped"))
+
+
+@pytest.fixture
+def rank_promotion() -> Iterator[None]:
+    with jax.numpy_rank_promotion("allow"):
+        yield
 
 
 @pytest.fixture
@@ -182,6 +192,7 @@ def test_success_ends_the_episode_and_pays_one(plain: Compiled, state: Functiona
     assert after.reward[1] > 1
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 def test_a_batch_of_actions_for_one_world_is_refused(plain: Compiled, state: FunctionalState) -> None:
     with pytest.raises(FunctionalError, match=r"jax\.vmap"):
         plain.env.step(jax.tree.map(lambda x: x[0], state), jnp.zeros((WORLDS, 7)))
@@ -237,6 +248,7 @@ def test_every_scene_resets_and_steps(scene_id: str) -> None:
 
 # Pure JAX takes four times as long to compile: half a minute a scene, 20 minutes for all of them.
 @pytest.mark.heavy
+@pytest.mark.usefixtures("rank_promotion")
 @pytest.mark.parametrize("scene_id", fullest_scenes())
 def test_a_scene_of_every_kind_resets_and_steps_in_pure_jax(scene_id: str) -> None:
     reset_and_step(scene_id, impl="jax", geometry="lean")
@@ -258,6 +270,7 @@ def reset_and_step(scene_id: str, impl: str, geometry: str) -> None:
 
 
 @pytest.mark.heavy
+@pytest.mark.usefixtures("rank_promotion")
 def test_derivatives_of_a_step_are_those_of_finite_differences() -> None:
     env = made(impl="jax", geometry="lean", budget=ROOMY["jax"])
     state = compiled(env.reset)(jax.random.key(0))

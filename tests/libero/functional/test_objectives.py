@@ -16,6 +16,7 @@ from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.scene import Scene
 from vecenv.libero.tasks.sources import installed_tasks
 
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 SOUP = "alphabet_soup_1"
 OPEN = np.array([1.0, -1.0])

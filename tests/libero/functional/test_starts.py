@@ -21,6 +21,7 @@ from vecenv.libero.tasks.sources import installed_tasks
 DRAWS = 24
 # Bowls in a tight row with a plate; bowls on a cabinet and on a stove.
 TASKS = (("libero_spatial", 0), ("libero_spatial", 9))
+pytestmark = pytest.mark.usefixtures("no_rank_promotion")
 compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 

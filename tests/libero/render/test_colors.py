@@ -25,6 +25,7 @@ from vecenv.libero.render.options import RenderConfig, RenderError, VisualOption
 from vecenv.libero.render.scenery import Scenery, installed_scenery
 from vecenv.libero.tasks.export import export
 from vecenv.libero.tasks.sources import installed_tasks
+from vecenv.libero.tasks.suites import list_tasks
 
 FOLDER = DATA / "upstream_images"
 # Its floor and a bottle's map are PNG files with an sRGB chunk.
@@ -59,7 +60,7 @@ def enough() -> float:
 
 def problem(scene: str) -> Any:
     suite, task = scene.rsplit("-", 1)
-    return vecenv.list_tasks(suite)[int(task)].problem()
+    return list_tasks(suite)[int(task)].problem()
 
 
 @needs_gl

@@ -17,7 +17,6 @@ import pytest
 from support.images import needs_gl, psnr
 
 import vecenv
-from vecenv.contract import Egocentric
 from vecenv.libero.functional import FunctionalConfig, FunctionalLibero
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.mjx.options import compiler_options
@@ -34,6 +33,8 @@ from vecenv.libero.render.options import (
 from vecenv.libero.render.raytrace import RayTracer, Style, poses, style_of
 from vecenv.libero.render.scenery import Scenery, installed_scenery
 from vecenv.libero.tasks.sources import installed_tasks
+from vecenv.libero.tasks.suites import list_tasks
+from vecenv.observations import Egocentric
 
 pytest.importorskip("warp")
 
@@ -47,7 +48,7 @@ OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level
 
 @cache
 def scenery(suite: str = "libero_spatial", task: int = 0) -> Scenery:
-    return installed_scenery(vecenv.list_tasks(suite)[task].problem())
+    return installed_scenery(list_tasks(suite)[task].problem())
 
 
 @cache
@@ -318,7 +319,7 @@ def test_functional_observations_have_the_views_that_playground_expects() -> Non
 
 
 def test_functional_images_have_the_colours_that_are_asked_for(tmp_path: Path) -> None:
-    installed_scenery(vecenv.list_tasks("libero_spatial")[0].problem(), colors="current").save(tmp_path / "dark.npz")
+    installed_scenery(list_tasks("libero_spatial")[0].problem(), colors="current").save(tmp_path / "dark.npz")
     config = FunctionalConfig(
         impl="warp",
         budget=Budget(contacts=500, rows=1500, pairs=1, candidates=500),

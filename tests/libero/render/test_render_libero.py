@@ -9,11 +9,11 @@ import pytest
 from support.images import needs_gl
 
 import vecenv
-from vecenv.contract import Egocentric, ImagesUnavailable
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.render import gl
 from vecenv.libero.render.gl import GlError
 from vecenv.libero.render.options import CameraShift, RenderConfig, RenderError, UserCamera, VisualOptions
+from vecenv.observations import Egocentric, ImagesUnavailable
 
 pytestmark = needs_gl
 

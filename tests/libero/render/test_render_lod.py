@@ -12,6 +12,7 @@ import vecenv
 from vecenv.libero.render import lod
 from vecenv.libero.render.options import RenderConfig
 from vecenv.libero.scene.scene import compile_scene
+from vecenv.libero.tasks.suites import list_tasks
 
 # What the project promises of each image.
 LEAST = {"exact": (45.0, 0.99), "fast": (32.0, 0.95)}
@@ -28,7 +29,7 @@ def corner_rows(model: mujoco.MjModel, index: int) -> set[bytes]:
 
 @pytest.mark.parametrize(("level", "share"), [("original", 1.0), ("exact", 0.9), ("fast", 0.25)])
 def test_meshes_lose_triangles_but_keep_their_corners(level: str, share: float) -> None:
-    problem = vecenv.list_tasks("libero_object")[0].problem()
+    problem = list_tasks("libero_object")[0].problem()
     model = compile_scene(problem, visual=True).model
     drawn = list(lod.drawn_meshes(model))
     before, original = model.mesh_facenum.copy(), {index: corner_rows(model, index) for index in drawn}
@@ -43,7 +44,7 @@ def test_meshes_lose_triangles_but_keep_their_corners(level: str, share: float) 
 
 
 def test_triangles_that_stay_keep_their_normals() -> None:
-    model = compile_scene(vecenv.list_tasks("libero_object")[0].problem(), visual=True).model
+    model = compile_scene(list_tasks("libero_object")[0].problem(), visual=True).model
     index = next(i for i in lod.drawn_meshes(model) if model.mesh(i).name.startswith("milk_1"))
     mesh = lod.Mesh.of(model, index)
     before, kept = mesh.normal[mesh.face_normal], lod.simplified("exact")[mesh.key].kept

@@ -17,9 +17,10 @@ from support import upstream
 from support.images import needs_gl, psnr
 
 import vecenv
-from vecenv.contract import Egocentric
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.render.options import RenderConfig
+from vecenv.libero.tasks.suites import list_tasks
+from vecenv.observations import Egocentric
 
 pytestmark = needs_gl
 
@@ -31,7 +32,7 @@ ENOUGH = {"exact": 45.0, "original": 60.0}
 @contextmanager
 def pair(suite: str, task: int, episode: int, level: str = "exact") -> Iterator[tuple[Any, dict[str, Any], LiberoEnv]]:
     """Upstream right after ``set_init_state``, its observation, and ours in the same start."""
-    spec = vecenv.list_tasks(suite)[task]
+    spec = list_tasks(suite)[task]
     peer = upstream.peer_with_images(spec.bddl_path)
     with upstream.silence():
         peer.reset()  # which hides what a new environment still shows: the gripper's frames

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import vecenv
-from vecenv.cli import build_app
+from vecenv.cli import COMMAND_GROUP, build_app
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.scene import goals
 from vecenv.libero.tasks import settled
@@ -87,7 +88,8 @@ def make(folder: Path, suite: str = "libero_goal", **options: Any) -> LiberoEnv:
 
 
 def compile_command(*arguments: str | Path) -> Result:
-    return CliRunner(env={"COLUMNS": "200"}).invoke(build_app([]), ["compile", *map(str, arguments)])
+    compiling = EntryPoint("compile", "vecenv.libero.cli:compile_command", COMMAND_GROUP)
+    return CliRunner(env={"COLUMNS": "200"}).invoke(build_app([compiling]), ["compile", *map(str, arguments)])
 
 
 def test_without_any_assets_episodes_are_bit_identical_to_those_of_the_installed_packages(

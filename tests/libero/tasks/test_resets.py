@@ -23,6 +23,7 @@ from vecenv.libero.tasks.fixtures import placements, poses
 from vecenv.libero.tasks.resets import ResetError, Resets, placed_at
 from vecenv.libero.tasks.suites import TaskSpec, list_suites, list_tasks
 from vecenv.protocols import MAX_SEED, ProtocolError, ResetLoop, ResetPoint, reset_loop
+from vecenv.registry import OptionError
 
 ONCE = ResetLoop()
 RECORDED = json.loads((DATA / "upstream_resets.json").read_text())["resets"]
@@ -202,8 +203,12 @@ def test_an_environment_an_episode_has_no_earlier_resets() -> None:
 def test_seeds_that_upstream_does_not_take_are_refused(seed: Any) -> None:
     with pytest.raises(ProtocolError, match=f"integers from 0 to {MAX_SEED}"):
         ONCE.at(seed, 0, 0)
+
+
+@pytest.mark.parametrize("seed", [-1, MAX_SEED + 1, True, 1.5, "7"])
+def test_a_configuration_with_such_a_seed_is_refused_before_anything_is_built(seed: Any) -> None:
     with pytest.raises(ProtocolError, match=f"integers from 0 to {MAX_SEED}"):
-        LiberoConfig(fixtures="upstream", start="raw", seed=seed)
+        LiberoConfig(fixtures="upstream", start="raw", seed=seed).rules("libero_goal")
 
 
 @pytest.mark.parametrize(
@@ -219,7 +224,9 @@ def test_seeds_that_upstream_does_not_take_are_refused(seed: Any) -> None:
 def test_what_is_no_loop_is_refused(given: Any, message: str) -> None:
     with pytest.raises(ProtocolError, match=message):
         reset_loop(given)
-    with pytest.raises(ProtocolError, match=message):
+    # `make` checks the types of options first.
+    error, expected = (OptionError, 'can not match type "str"') if given == "once" else (ProtocolError, message)
+    with pytest.raises(error, match=expected):
         vecenv.make("libero_goal", task=0, episodes=[0], fixtures="upstream", start="raw", reset_loop=given)
 
 

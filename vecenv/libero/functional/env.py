@@ -21,9 +21,9 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
+from jaxtyping import Array, Float, PRNGKeyArray
 from mujoco import mjx
 
 from vecenv.libero import starts as episode_starts
@@ -51,6 +51,7 @@ from vecenv.libero.scene.scene import Scene
 from vecenv.libero.tasks.export import exported_tasks
 from vecenv.libero.tasks.sources import Task, installed_tasks
 from vecenv.libero.tasks.suites import UnknownTask
+from vecenv.util.arrays import AnyArray
 
 
 class FunctionalLibero:
@@ -108,7 +109,7 @@ class FunctionalLibero:
 
     # -- the two functions ---------------------------------------------------------------------------------------------
 
-    def reset(self, rng: jax.Array) -> FunctionalState:
+    def reset(self, rng: PRNGKeyArray) -> FunctionalState:
         """Begin an episode in a start drawn with the key ``rng``."""
         start = self._starts.stored(rng) if self.config.placement == "stored" else self._starts.regions(rng)
         data = self._physics.begin(self._mjx_model, start)
@@ -123,7 +124,7 @@ class FunctionalLibero:
             info={"episode": start.episode},
         )
 
-    def step(self, state: FunctionalState, action: jax.Array) -> FunctionalState:
+    def step(self, state: FunctionalState, action: Float[AnyArray, " action_size"]) -> FunctionalState:
         """Advance by one control step, 50 ms.
 
         Args:
@@ -148,7 +149,7 @@ class FunctionalLibero:
             info={**state.info},
         )
 
-    def _prepared(self, action: jax.Array) -> jax.Array:
+    def _prepared(self, action: Float[AnyArray, "..."]) -> Float[Array, " action_size"]:
         action = jnp.asarray(action, jnp.result_type(float))
         if action.shape != (self.action_size,):
             raise FunctionalError(

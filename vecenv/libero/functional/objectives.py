@@ -70,8 +70,8 @@ class Box(NamedTuple):
     """A box in a body's frame: ``body`` id, ``centre`` [3] and ``half`` extents [3] in metres."""
 
     body: int
-    centre: np.ndarray
-    half: np.ndarray
+    centre: Float[np.ndarray, "3"]
+    half: Float[np.ndarray, "3"]
 
 
 def default_target(scene: Scene, problem: Problem, *, movable: bool) -> str:
@@ -109,7 +109,7 @@ def body_box(model: mujoco.MjModel, body: int) -> Box:
     return Box(body, ((low + high) / 2).astype(np.float32), ((high - low) / 2).astype(np.float32))
 
 
-def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Float[np.ndarray, "8 3"]:
     """World positions of the corners of the box around a geom, [8, 3]."""
     centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
     local = centre + half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -262,7 +262,7 @@ def _axes(view: View, body: int) -> Float[Array, "3 3"]:
 
 
 def _centre(view: View, box: Box) -> Float[Array, "3"]:
-    return view.xpos[box.body] + jnp.sum(_axes(view, box.body) * box.centre, axis=-1)
+    return view.xpos[box.body] + jnp.sum(_axes(view, box.body) * box.centre[None], axis=-1)
 
 
 def _distance(view: View, box: Box, point: Float[Array, "3"]) -> Float[Array, ""]:

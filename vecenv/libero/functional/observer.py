@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vecenv.libero.functional.config import PIXELS
 from vecenv.libero.functional.objectives import Objective
@@ -62,7 +61,7 @@ class Observer:
         views = {f"{PIXELS}/view_{view}": shape for view in range(len(POLICY_CAMERAS))}
         return {**({"state": (self.width,)} if self.width else {}), **views}
 
-    def __call__(self, data: Data) -> Float[Array, " n"] | dict[str, jax.Array]:
+    def __call__(self, data: Data) -> Float[Array, " n"] | dict[str, Float[Array, "..."]]:
         """The observation of one world: float32 [width], or with images a dictionary."""
         vector = self._vector(data) if self.width else None
         if self._tracer is None:
@@ -79,16 +78,16 @@ class Observer:
         parts += self._objects(data) if "objects" in self._names else ()
         return jnp.nan_to_num(jnp.concatenate(parts).astype(jnp.float32), posinf=0.0, neginf=0.0)
 
-    def _proprio(self, data: Data) -> list[jax.Array]:
+    def _proprio(self, data: Data) -> list[Float[Array, " _"]]:
         arm, fingers, world = slice(0, ARM_DOFS), slice(ARM_DOFS, ROBOT_DOFS), data.world
         return [data.qpos[arm], data.qvel[arm], world.fingers, data.qvel[fingers], world.eef_pos, world.eef_quat]
 
-    def _objects(self, data: Data) -> list[jax.Array]:
+    def _objects(self, data: Data) -> list[Float[Array, " _"]]:
         poses = jnp.concatenate([data.xpos[self._bodies], data.xquat[self._bodies]], axis=1)
         return [self._objective.offset(data.view), poses.reshape(-1), data.qpos[self._joints]]
 
 
-def _fixture_joints(scene: Scene) -> np.ndarray:
+def _fixture_joints(scene: Scene) -> Int[np.ndarray, " J"]:
     """Addresses in qpos of the joints of fixtures, int [J]."""
     joints = [scene.model.joint(joint) for entity in scene.fixtures for joint in entity.joints]
     return np.array([joint.qposadr[0] for joint in joints], int)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, PyTree
 from mujoco import mjx
 
 from vecenv.controllers import gripper as gripper_control
@@ -82,7 +82,7 @@ class WorldPhysics:
     def _sized(self, function: Callable[..., Data]) -> Callable[..., Data]:
         return Sized(function, lambda num_worlds: self._blank(num_worlds)())
 
-    def _alone(self, function: Callable[..., Data], *args: Any) -> Data:
+    def _alone(self, function: Callable[..., Data], *args: PyTree) -> Data:
         return function(self._blank(1)(), *args)
 
     def _blank(self, num_worlds: int) -> Callable[[], mjx.Data]:
@@ -129,7 +129,7 @@ def _joint_step(system: System, world: World, action: Float[Array, "8"], limits:
     model = system.model.replace(body_pos=world.body_pos, body_quat=world.body_quat)
     goal = joint_control.set_goal(world.data.qpos[:ARM_DOFS], action[:ARM_DOFS], limits.astype(action.dtype))
 
-    def advance(carry: tuple[mjx.Data, jax.Array, jax.Array], _: None) -> tuple[Any, Any]:
+    def advance(carry: tuple[mjx.Data, Float[Array, "2"], Int[Array, ""]], _: None) -> tuple[Any, Any]:
         data, fingers, fault = carry
         robot = data.qpos[:ROBOT_DOFS]
         arm = kinematics.arm_state(system.chain, robot, data.qvel[:ROBOT_DOFS])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PRNGKeyArray, UInt32
 from mujoco import mjx
 
 from vecenv.libero.functional.config import FunctionalError
@@ -41,14 +42,16 @@ class Randomization:
                 raise FunctionalError(f"{field.name}=({low}, {high}): expected 0 < lower <= upper factor")
 
 
-def randomize(model: mjx.Model, rng: jax.Array, config: Randomization = Randomization()) -> tuple[mjx.Model, mjx.Model]:
+def randomize(
+    model: mjx.Model, rng: Key[Array, " n"] | UInt32[Array, "n 2"], config: Randomization = Randomization()
+) -> tuple[mjx.Model, mjx.Model]:
     """Vary a model for each of n worlds, as Brax's and Playground's ``randomization_fn``.
 
     The controllers keep the nominal arm: what they compensate is off by as much as the arm was varied.
 
     Args:
         model: ``env.mjx_model``.
-        rng: keys, [n, ...].
+        rng: n keys.
         config: how much.
 
     Returns:
@@ -59,18 +62,18 @@ def randomize(model: mjx.Model, rng: jax.Array, config: Randomization = Randomiz
     return model.tree_replace(varied), axes.tree_replace(dict.fromkeys(varied, 0))
 
 
-def _varied(model: mjx.Model, rng: jax.Array, *, config: Randomization) -> dict[str, jax.Array]:
+def _varied(model: mjx.Model, rng: PRNGKeyArray, *, config: Randomization) -> dict[str, Float[Array, "..."]]:
     """Fields of one world."""
     keys = dict(zip((field.name for field in dataclasses.fields(config)), jax.random.split(rng, 6), strict=True))
 
-    def factor(name: str, shape: tuple[int, ...] = ()) -> jax.Array:
+    def factor(name: str, shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         low, high = getattr(config, name)
         return jax.random.uniform(keys[name], shape, minval=low, maxval=high)
 
     mass = factor("mass", (model.nbody,))
     fingers = jnp.where(jnp.arange(model.nu) >= ARM_DOFS, factor("gripper"), 1.0)[:, None]
     return {
-        "geom_friction": model.geom_friction * jnp.stack([factor("friction"), *[jnp.ones(())] * 2]),
+        "geom_friction": model.geom_friction * jnp.stack([factor("friction"), *[jnp.ones(())] * 2])[None],
         "body_mass": model.body_mass * mass,
         "body_inertia": model.body_inertia * mass[:, None],
         "dof_damping": model.dof_damping * factor("damping", (model.nv,)),

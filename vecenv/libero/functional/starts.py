@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vecenv.errors import InvalidInput
 from vecenv.libero.scene import surface
@@ -84,9 +84,9 @@ class _Footprints(NamedTuple):
         radius: of the circle, metres, [...].
     """
 
-    centre: Any
-    half: Any
-    radius: Any
+    centre: Float[AnyArray, "*n 2"]
+    half: Float[AnyArray, "*n 2"]
+    radius: Float[AnyArray, "*n"]
 
 
 class _Layout(NamedTuple):
@@ -138,11 +138,11 @@ class Starts:
             rows.append([_footprint(self._scene, data, thing.entity) for thing in self._things])
         return _Footprints(*(np.array([[print_[k] for print_ in row] for row in rows]) for k in range(3)))
 
-    def stored(self, rng: jax.Array) -> Begin:
+    def stored(self, rng: PRNGKeyArray) -> Begin:
         """One of the settled starts, each as likely as any other."""
         return self._row(jax.random.randint(rng, (), 0, len(self._episodes)))
 
-    def _row(self, row: jax.Array) -> Begin:
+    def _row(self, row: Int[Array, ""]) -> Begin:
         return Begin(
             qpos=_real(self._qpos)[row],
             qvel=_real(self._qvel)[row],
@@ -151,7 +151,7 @@ class Starts:
             episode=jnp.asarray(self._episodes)[row],
         )
 
-    def regions(self, rng: jax.Array) -> Begin:
+    def regions(self, rng: PRNGKeyArray) -> Begin:
         """A settled start whose fixtures and objects were moved to places drawn from their regions."""
         first, second = jax.random.split(rng)
         row = jax.random.randint(first, (), 0, len(self._episodes))
@@ -164,18 +164,18 @@ class Starts:
             begin = move(begin, thing, layout.spot[index], layout.yaw[index])
         return begin
 
-    def _clear_layout(self, rng: jax.Array, row: jax.Array) -> _Layout:
+    def _clear_layout(self, rng: PRNGKeyArray, row: Int[Array, ""]) -> _Layout:
         """The first of many draws in which nothing overlaps, else the one that overlaps least."""
         layouts = jax.vmap(self._layout)(jax.random.split(rng, LAYOUTS))
         footprints = jax.tree.map(lambda x: _real(x)[row], self._footprints)
         fixed = np.array([thing.entity.fixture for thing in self._things])
         first, second = np.triu_indices(len(fixed), 1)
         matters = ~(fixed[first] & fixed[second])
-        overlap = _overlaps(footprints, layouts, first[matters], second[matters])
+        overlap = jax.vmap(lambda layout: _overlaps(footprints, layout, first[matters], second[matters]))(layouts)
         best = jnp.argmin(jnp.sum(overlap, axis=-1))
         return jax.tree.map(lambda x: x[best], layouts)
 
-    def _layout(self, rng: jax.Array) -> _Layout:
+    def _layout(self, rng: PRNGKeyArray) -> _Layout:
         keys = jax.random.split(rng, len(self._things))
         places = [_draw(thing.placement, key) for thing, key in zip(self._things, keys, strict=True)]
         return _Layout(*(jnp.stack(parts) for parts in zip(*places, strict=True)))
@@ -215,7 +215,7 @@ class Starts:
         return begin._replace(qvel=qvel)
 
 
-def _central(scene: Scene, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+def _central(scene: Scene, problem: Problem) -> tuple[Float[np.ndarray, "nbody 3"], Float[np.ndarray, "nbody 4"]]:
     """Body positions and orientations with the fixtures at the centres of their regions, where the starts settled."""
     pos, quat = np.array(scene.model.body_pos), np.array(scene.model.body_quat)
     for placement in fixtures.placements(problem, scene).values():
@@ -265,7 +265,9 @@ def _stands_on(name: str, below: str, supports: dict[str, str]) -> bool:
     return False
 
 
-def _footprint(scene: Scene, data: mujoco.MjData, entity: Entity) -> tuple[np.ndarray, np.ndarray, float]:
+def _footprint(
+    scene: Scene, data: mujoco.MjData, entity: Entity
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], float]:
     """Centre [2], half sides [2] and radius of what a thing covers; a fixture's as seen in its own frame."""
     body = scene.model.body(entity.root_body).id
     corners, _ = surface.entity_corners(scene, entity.name).world(data.xpos[None], data.xmat[None])
@@ -279,7 +281,7 @@ def _footprint(scene: Scene, data: mujoco.MjData, entity: Entity) -> tuple[np.nd
     return centre, half, radius * (_FLARE if is_round else 1.0)
 
 
-def _draw(placement: FixturePlacement, rng: jax.Array) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+def _draw(placement: FixturePlacement, rng: PRNGKeyArray) -> tuple[Float[Array, "2"], Float[Array, ""]]:
     """A place [2] and yaw, uniform in one of the rectangles."""
     which, where = jax.random.split(rng)
     ranges = _real(placement.ranges)
@@ -289,8 +291,10 @@ def _draw(placement: FixturePlacement, rng: jax.Array) -> tuple[Float[Array, "2"
     return _real(placement.origin[:2]) + low + u[:2] * (high - low), least + u[2] * (most - least)
 
 
-def _overlaps(footprints: _Footprints, layout: _Layout, first: np.ndarray, second: np.ndarray) -> jax.Array:
-    """By how much pairs of things overlap, metres, [..., pairs]; 0 where rectangles or circles lie apart."""
+def _overlaps(
+    footprints: _Footprints, layout: _Layout, first: Int[np.ndarray, " pairs"], second: Int[np.ndarray, " pairs"]
+) -> Float[Array, " pairs"]:
+    """By how much pairs of things overlap, metres, [pairs]; 0 where rectangles or circles lie apart."""
     cos, sin = jnp.cos(layout.yaw), jnp.sin(layout.yaw)
     axes = jnp.stack([jnp.stack([cos, sin], -1), jnp.stack([-sin, cos], -1)], -2)
     middle = layout.spot + jnp.sum(axes * footprints.centre[..., None], axis=-2)
@@ -299,16 +303,18 @@ def _overlaps(footprints: _Footprints, layout: _Layout, first: np.ndarray, secon
     for owner in (first, second):
         for k in range(2):
             along = axes[..., owner, k, :]
-            reach = sum(_reach(axes[..., i, :, :], footprints.half[i], along) for i in (first, second))
+            reach = sum(_reach(axes[..., i, :, :], jnp.asarray(footprints.half)[i], along) for i in (first, second))
             gaps.append(jnp.abs(jnp.sum(apart * along, -1)) - reach)
     return jnp.maximum(-jnp.max(jnp.stack(gaps), axis=0), 0.0)
 
 
-def _reach(axes: jax.Array, half: jax.Array, along: jax.Array) -> jax.Array:
+def _reach(
+    axes: Float[Array, "pairs 2 2"], half: Float[Array, "pairs 2"], along: Float[Array, "pairs 2"]
+) -> Float[Array, " pairs"]:
     """How far rectangles extend from their middles along a direction, metres."""
     return jnp.sum(half * jnp.abs(jnp.sum(axes * along[..., None, :], -1)), -1)
 
 
-def _real(values: AnyArray | Sequence[Sequence[float]] | Sequence[float]) -> jax.Array:
+def _real(values: AnyArray | Sequence[Sequence[float]] | Sequence[float]) -> Float[Array, "..."]:
     """As floats of JAX's default width."""
     return jnp.asarray(values, jnp.result_type(float))

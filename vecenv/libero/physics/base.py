@@ -12,7 +12,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import numpy as np
@@ -136,6 +136,9 @@ class Group(Protocol):
         ...
 
 
+G = TypeVar("G", bound=Group)
+
+
 @dataclass(frozen=True)
 class RunResult:
     """The result of ``run``.
@@ -164,7 +167,7 @@ class FollowResult(RunResult):
     waypoint_ticks: np.ndarray
 
 
-class Physics(ABC):
+class Physics(ABC, Generic[G]):
     """A batch of simulations with their controllers and goals.
 
     Attributes:
@@ -178,7 +181,7 @@ class Physics(ABC):
 
     @property
     @abstractmethod
-    def groups(self) -> Sequence[Any]:
+    def groups(self) -> Sequence[G]:
         """The slots by scene."""
 
     @property
@@ -200,11 +203,11 @@ class Physics(ABC):
         ...
 
     @abstractmethod
-    def place(self, group: Any, slots: np.ndarray, start: Start) -> None:
+    def place(self, group: G, slots: np.ndarray, start: Start) -> None:
         """Begin an episode in ``slots``, which belong to ``group``: physics state, fixture poses, controller memory."""
 
     @abstractmethod
-    def write_state(self, group: Any, qpos: np.ndarray, qvel: np.ndarray, time: np.ndarray) -> None:
+    def write_state(self, group: G, qpos: np.ndarray, qvel: np.ndarray, time: np.ndarray) -> None:
         """Overwrite the physics state of a group ([n, nq], [n, nv], seconds [n]); the controller keeps its memory."""
 
     @abstractmethod
@@ -376,7 +379,7 @@ def _follower(config: waypoint.WaypointConfig) -> _Follower:
 def _on_cpu(function: Callable[..., Any]) -> Callable[..., Any]:
     jitted, cpu = jax.jit(function), jax.devices("cpu")[0]
 
-    def call(*args: Any) -> Any:
+    def call(*args: object) -> Any:
         with jax.enable_x64(True), jax.default_device(cpu):
             return jitted(*args)
 

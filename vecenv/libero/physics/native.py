@@ -325,7 +325,7 @@ def home_row(scene: Scene) -> np.ndarray:
     return views.rows()
 
 
-class NativePhysics(Physics):
+class NativePhysics(Physics[Group]):
     """The batch: ``num_envs`` slots in the caller's order.
 
     Args:

@@ -1,9 +1,9 @@
 """The constraint solver of ``impl="jax"``: Newton's method on MuJoCo's primal problem, each island with its own steps.
 
 In: data of one world after ``mjx.fwd_acceleration``. Out: the acceleration that constraints allow, and their force.
-It stands in for ``mjx.solve``, which loses LIBERO's scenes in float32: where a contact with an elliptic cone sticks,
-its line search takes the root of a small number that rounding made negative, and gives up at once on the NaN; and one
-step length for all objects makes every object wait for the one that has just begun to slide.
+It replaces ``mjx.solve``, which fails on LIBERO's scenes in float32: where a contact with an elliptic cone sticks, its
+line search takes the root of a small number that rounding made negative, and stops at the NaN; and with one step length
+for all objects, a single object that begins to slide slows down the convergence of all others.
 
 The problem (MuJoCo's documentation, "Computation"): minimise over accelerations a
 
@@ -26,23 +26,23 @@ import numpy as np
 from jax import lax
 from mujoco import mjx
 
-# A line search ends where the slope is this part of the first one.
+# A line search ends where the slope is this fraction of the initial slope.
 _SLOPE = 0.02
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Which constraint rows are what; known when the model is.
+    """Which constraint rows are of which kind; a function of the model alone.
 
     Attributes:
-        equal: rows of equality constraints, which come first.
-        rubbing: rows of dry friction in joints, which come next.
+        equal: number of rows of equality constraints, which come first.
+        frictional: number of rows of dry friction in joints, which come next.
         cones: contacts with elliptic cones: number of rows of each, first row, first contact, number of contacts.
         trees: of each degree of freedom the kinematic tree, one-hot, [nv, ntree].
     """
 
     equal: int
-    rubbing: int
+    frictional: int
     cones: Sequence[tuple[int, int, int, int]]
     trees: np.ndarray
 
@@ -97,7 +97,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         return _gradient(layout, problem, qacc)
 
     def minimum(_: object, guess: jax.Array) -> jax.Array:
-        # In float64 to the end: derivatives are those of the exact minimum.
+        # In float64 this iterates to full precision, because derivatives are those of the exact minimum.
         tolerance = jnp.minimum(model.opt.tolerance, jnp.finfo(guess.dtype).eps) * jnp.trace(problem.mass)
         return _newton(layout, problem, guess, limits, tolerance)
 
@@ -134,7 +134,7 @@ def _problem(model: mjx.Model, data: mjx.Data) -> _Problem:
 
 
 class _Curvature(NamedTuple):
-    """Second derivatives: of the rows before the first cone, and of cones [n, dim, dim]."""
+    """Second derivatives: of the rows before the first cone, and of the cones [n, dim, dim]."""
 
     alone: jax.Array
     cones: tuple[jax.Array, ...]
@@ -153,12 +153,12 @@ def _pull(layout: _Layout, problem: _Problem, x: jax.Array) -> tuple[jax.Array, 
 
 
 def _pull_alone(layout: _Layout, problem: _Problem, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Of rows by themselves: equalities pull both ways, limits and edges of pyramids one way, dry friction slips."""
+    """Likewise for single rows: equalities act both ways, limits and pyramid edges one way, dry friction slips."""
     index, stiff, rub = np.arange(len(x)), problem.stiff[: len(x)], problem.rub[: len(x)]
-    equal, rubbing = index < layout.equal, (index >= layout.equal) & (index < layout.equal + layout.rubbing)
+    equal, frictional = index < layout.equal, (index >= layout.equal) & (index < layout.equal + layout.frictional)
     slope = stiff * x
-    slips = rubbing & (jnp.abs(slope) > rub)
-    lets_go = ~equal & ~rubbing & (x >= 0)
+    slips = frictional & (jnp.abs(slope) > rub)
+    lets_go = ~equal & ~frictional & (x >= 0)
     free = slips | lets_go
     slope = jnp.where(free, jnp.where(slips, jnp.sign(x) * rub, 0.0), slope)
     return slope, jnp.where(free, 0.0, stiff)
@@ -168,7 +168,7 @@ def _pull_cone(x: jax.Array, cone: _Cones) -> tuple[jax.Array, jax.Array]:
     """Slope [dim] and curvature [dim, dim] of one elliptic contact: normal first, then tangents.
 
     In scaled coordinates u, half the squared distance to the cone ``normal >= mu |tangent|``: nothing inside, the
-    distance to the tip in the polar cone, the distance to the surface between.
+    distance to the tip in the polar cone, and the distance to the surface elsewhere.
     """
     u, mu = cone.scale * x, cone.mu
     normal, tangent = u[0], u[1:]
@@ -193,14 +193,14 @@ def _bent(layout: _Layout, curvature: _Curvature, rows: jax.Array) -> jax.Array:
     parts = [(curvature.alone * rows[:alone].T).T]
     for (dim, row, _, count), blocks in zip(layout.cones, curvature.cones, strict=True):
         own = rows[row : row + dim * count].reshape(count, dim, -1)
-        # Written out, because so small matrices are multiplied slower by a library than in one loop.
+        # An explicit loop, because a library call is slower for matrices as small as these.
         turned = sum(blocks[:, :, j, None] * own[:, None, j] for j in range(dim))
         parts.append(jnp.asarray(turned).reshape(dim * count, *rows.shape[1:]))
     return jnp.concatenate(parts)
 
 
 def _gradient(layout: _Layout, problem: _Problem, qacc: jax.Array) -> jax.Array:
-    """Of the whole cost, [nv]."""
+    """Gradient of the whole cost, [nv]."""
     slope, _ = _pull(layout, problem, problem.jacobian @ qacc - problem.reference)
     return problem.mass @ qacc - problem.force + problem.jacobian.T @ slope
 
@@ -210,7 +210,7 @@ def _gradient(layout: _Layout, problem: _Problem, qacc: jax.Array) -> jax.Array:
 
 
 class _Islands(NamedTuple):
-    """Trees that rows tie together: ``first`` [R, ntree], one-hot, a tree of each row; ``mates`` [ntree, ntree]."""
+    """Trees connected by rows: ``first`` [R, ntree], one-hot, a tree per row; ``mates`` [ntree, ntree], by island."""
 
     first: jax.Array
     mates: jax.Array
@@ -234,7 +234,7 @@ def _islands(layout: _Layout, jacobian: jax.Array) -> _Islands:
 
 
 class _Carry(NamedTuple):
-    """Acceleration [nv], gradient of the cost there [nv], how much the next step might gain, steps taken."""
+    """Acceleration [nv], gradient of the cost there [nv], expected decrease of the next step, number of steps."""
 
     qacc: jax.Array
     gradient: jax.Array
@@ -245,7 +245,7 @@ class _Carry(NamedTuple):
 def _newton(
     layout: _Layout, problem: _Problem, guess: jax.Array, limits: tuple[int, int], tolerance: jax.Array
 ) -> jax.Array:
-    """The minimum, or where the iterations end."""
+    """The minimum, or the point that the last iteration reached."""
     islands = _islands(layout, problem.jacobian)
 
     def going(carry: _Carry) -> jax.Array:
@@ -260,7 +260,7 @@ def _newton(
         size = _line_search(layout, problem, islands, carry.qacc, x, search, limits[1])
         qacc = carry.qacc + layout.trees.astype(size.dtype) @ size * search
         gradient = _gradient(layout, problem, qacc)
-        # What another step would gain if the curvature stays what it was.
+        # Decrease of the next step if the curvature does not change.
         promise = gradient @ jax.scipy.linalg.cho_solve(factor, gradient) / 2
         return _Carry(qacc, gradient, promise, carry.steps + 1)
 
@@ -271,7 +271,7 @@ def _newton(
 
 
 class _Bracket(NamedTuple):
-    """Step sizes, each [ntree]: the present one with its slope, and bounds with slopes below and above 0."""
+    """Step sizes, each [ntree]: the current one with its slope, and bounds whose slopes are below and above 0."""
 
     size: jax.Array
     slope: jax.Array
@@ -289,7 +289,7 @@ def _line_search(
     search: jax.Array,
     tries: int,
 ) -> jax.Array:
-    """Step size of every tree, [ntree]: where the slope along the direction vanishes, the same within an island."""
+    """Step size of every tree, [ntree]: where the slope along the direction vanishes, equal within an island."""
     trees = layout.trees.astype(x.dtype)
     row_step = problem.jacobian @ search
     weight = problem.mass @ search
@@ -297,7 +297,7 @@ def _line_search(
     growth = (search * weight) @ trees
 
     def slopes(size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """First and second derivatives, and what the first's terms amount to without their signs."""
+        """First and second derivatives, and the sum of the absolute terms of the first."""
         first, curvature = _pull(layout, problem, x + (islands.first @ size) * row_step)
         first, second = first * row_step, row_step * _bent(layout, curvature, row_step)
         rows = jnp.stack([first, second, jnp.abs(first)]) @ islands.first

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from vecenv.contract import CameraView, Rendered
 from vecenv.libero.physics.base import Group
 from vecenv.libero.render.colors import visual_scene
 from vecenv.libero.render.drawing import ROBOT, Pose, Stage, camera_view
 from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.scene.bddl import Problem, SceneKey
+from vecenv.observations import CameraView, Rendered
 
 if TYPE_CHECKING:
     from vecenv.libero.render.raytrace import RayRenderer

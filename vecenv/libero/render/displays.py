@@ -14,13 +14,14 @@ import itertools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 from vecenv.util.cores import usable_cores
 
 _SURFACELESS = 0x31DD  # EGL_PLATFORM_SURFACELESS_MESA
 _SOFTWARE = b"swrast"
 _THREADS = "LP_NUM_THREADS"
+_CType: TypeAlias = type[ctypes.c_void_p | ctypes.c_char_p | ctypes.c_uint]
 _numbers = itertools.count()
 
 
@@ -67,7 +68,7 @@ class GlContext(Protocol):
 class _Context:
     """A context on the second display."""
 
-    def __init__(self, display: Any) -> None:
+    def __init__(self, display: ctypes.c_void_p) -> None:
         from mujoco import egl
         from OpenGL import EGL
 
@@ -93,7 +94,7 @@ class _Context:
             self._egl.eglReleaseThread()
         self._context = None
 
-    def _current(self, context: Any) -> Any:
+    def _current(self, context: ctypes.c_void_p | None) -> Any:
         nothing = self._egl.EGL_NO_SURFACE
         return self._egl.eglMakeCurrent(self._display, nothing, nothing, context)
 
@@ -115,13 +116,13 @@ def _second_display() -> Any:
     return display
 
 
-def _is_software(display: Any) -> bool:
+def _is_software(display: ctypes.c_void_p) -> bool:
     """Whether Mesa's driver of an initialised display is its software one."""
     name = _procedure(b"eglGetDisplayDriverName", ctypes.c_char_p, ctypes.c_void_p)
     return name is not None and name(ctypes.cast(display, ctypes.c_void_p)) == _SOFTWARE
 
 
-def _procedure(name: bytes, result: Any, *arguments: Any) -> Any:
+def _procedure(name: bytes, result: _CType, *arguments: _CType) -> Any:
     """A function of the EGL library that PyOpenGL has loaded, by name; None if the library lacks it."""
     from OpenGL import platform
 

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from vecenv.contract import CameraView
 from vecenv.libero.render.colors import SKIN
 from vecenv.libero.render.options import ALIASES, CameraShift, RenderError, UserCamera, VisualOptions, rotation_of
 from vecenv.libero.scene import catalog
 from vecenv.libero.scene.scene import Entity, Scene
+from vecenv.observations import CameraView
 
 # Groups that upstream draws: 1 holds visual geoms, 2 nothing; 0 are collision geoms. A culled geom moves to 5.
 DRAWN_GROUPS, _HIDDEN = (1, 2), 5

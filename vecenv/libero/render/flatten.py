@@ -29,7 +29,7 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 # A surface whose triangles have edges of at least this length, metres, has no highlights in GL, which lights corners
 # only.
 _COARSE = 0.05
-# MuJoCo draws the sites of the groups below this unless told otherwise.
+# MuJoCo draws the sites of the groups below this by default.
 _SITE_GROUPS = 3
 
 

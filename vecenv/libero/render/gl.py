@@ -28,11 +28,11 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from vecenv.contract import CameraView
 from vecenv.errors import SimulationError
 from vecenv.libero.render.displays import GlContext, egl_context
 from vecenv.libero.render.drawing import Pose, Stage, View, camera_view
 from vecenv.libero.render.options import RenderError, UserCamera, VisualOptions
+from vecenv.observations import CameraView
 from vecenv.util.cores import usable_cores
 
 # The libraries of each GL backend, and how to install one.

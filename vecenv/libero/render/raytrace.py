@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import PyTree
 from mujoco import mjx
 
 from vecenv.libero.physics.private import render_context
@@ -187,7 +188,7 @@ class RayTracer:
         return tiles.swapaxes(2, 3).reshape(-1, self.height, self.width, *rest)[:, :, ::-1]
 
     def _look_at(
-        self, context: Any, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array, style: Style | None = None
+        self, context: PyTree, xpos: jax.Array, xquat: jax.Array, qpos: jax.Array, style: Style | None = None
     ) -> Seen:
         style = self.plain_style if style is None else style
         model = self._put.replace(geom_rgba=self._colors(qpos, style), cam_fovy=self._widths(style))

@@ -29,10 +29,10 @@ class BDDLError(InvalidInput):
     """A task file that is not well-formed LIBERO BDDL.
 
     Attributes:
-        source: file name, or whatever the caller called the text.
+        source: file name, or the name that the caller gave the text.
         line: line of the offending place, from 1.
         column: column of the offending place in characters, from 1.
-        message: what is there instead.
+        message: what was found instead.
         expected: what should be there.
     """
 

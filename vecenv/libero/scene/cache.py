@@ -79,7 +79,7 @@ def cached_scene(
 
 
 def compiled_source(source: SceneSource, asked: geometry.Demands | None) -> Scene:
-    """The scene with upstream's collision geoms, or with lean ones for what is asked of its things."""
+    """The scene with upstream's collision geoms, or with lean ones that meet these demands."""
     return source.compile() if asked is None else geometry.lean_scene(source, asked)
 
 
@@ -88,7 +88,7 @@ def content_key(source: SceneSource, asked: geometry.Demands | None = None) -> s
 
     Args:
         source: the scene's source.
-        asked: what lean collision geoms are fitted for; None keeps upstream's.
+        asked: demands that lean collision geoms are fitted to; None keeps upstream's.
 
     Raises:
         OSError: a file that the MJCF refers to cannot be read.

@@ -1,4 +1,4 @@
-"""What LIBERO knows about a category beyond its MJCF file: where that lies, when a joint is open, how resets turn it.
+"""LIBERO's data on a category beyond its MJCF file: the file's path, when a joint is open, how resets turn it.
 
 Facts from ``libero/envs/objects``. Joint positions are metres for drawers and radians for doors and knobs.
 """
@@ -18,7 +18,7 @@ _FILE_NAMES = {"rack": "simple_rack"}
 
 
 class UnknownCategory(NotFound, KeyError):
-    """A BDDL file asks for an object category that the asset tree does not have; the message names it."""
+    """A BDDL file names an object category that the asset tree does not have; the message names it."""
 
     def __str__(self) -> str:
         return str(self.args[0])

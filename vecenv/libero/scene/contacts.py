@@ -8,7 +8,7 @@ published checkpoints come from there. Five things have changed since:
 * 3.13.0 keeps more vertices of a mesh on a plane (``vecenv.libero.physics.colliders.planemesh``).
 * 3.8.0 lets a flat cylinder touch in several points; the flag ``multiccd`` off brings the one point back.
 * 3.3.2 computes the depth of convex shapes whose pair has no margin to the last digit, where EPA used to stop within
-  1e-6 m: now and then the contact of an arm's mesh with a box then lies millimetres from where it was. A margin of
+  1e-6 m: occasionally the contact of an arm's mesh with a box then moves by millimetres. A margin of
   1e-12 m on meshes takes the earlier path.
 * 3.11.0 stops the solver when it expects the next Newton step to gain less than the tolerance; before, it took that
   step. A tighter tolerance, with the line search's kept as it was, gives the published accelerations to 1e-9.

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import mujoco
@@ -29,6 +30,7 @@ from vecenv.libero.scene import catalog
 from vecenv.libero.scene.arenas import ARENAS
 from vecenv.libero.scene.bddl import Predicate, Problem
 from vecenv.libero.scene.scene import Entity, RegionSite, Scene, contact_sensor_name, zone_site
+from vecenv.util.arrays import AnyArray
 
 TRUE, FALSE, UP, UP_REGION, IN_REGION, ON_REGION, ON_OBJECT, ANY_JOINT, ALL_JOINTS = range(9)
 
@@ -61,19 +63,19 @@ class GoalTable(NamedTuple):
         joint_used: which of the J entries exist, bool [n, P, J].
     """
 
-    kind: Any
-    body: Any
-    reference: Any
-    site: Any
-    zone_pos: Any
-    zone_mat: Any
-    size: Any
-    touch: Any
-    joint: Any
-    joint_sign: Any
-    joint_bound: Any
-    joint_inclusive: Any
-    joint_used: Any
+    kind: AnyArray
+    body: AnyArray
+    reference: AnyArray
+    site: AnyArray
+    zone_pos: AnyArray
+    zone_mat: AnyArray
+    size: AnyArray
+    touch: AnyArray
+    joint: AnyArray
+    joint_sign: AnyArray
+    joint_bound: AnyArray
+    joint_inclusive: AnyArray
+    joint_used: AnyArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +95,7 @@ class _Row:
 
 
 def contact_pairs(problems: Iterable[Problem]) -> tuple[tuple[str, str], ...]:
-    """The pairs of things whose contacts these tasks' goals ask for, each pair and the whole sorted by name."""
+    """The pairs of things whose contacts these tasks' goals test, each pair and the whole sorted by name."""
     return tuple(sorted({pair for problem in problems for pair in _contact_pairs(problem)}))
 
 
@@ -269,7 +271,14 @@ def _static_frame(model: mujoco.MjModel, body: str) -> tuple[np.ndarray, np.ndar
 
 
 def evaluate(
-    table: GoalTable, *, xpos: Any, site_xpos: Any, site_xmat: Any, qpos: Any, touch: Any, xp: Any = np
+    table: GoalTable,
+    *,
+    xpos: AnyArray,
+    site_xpos: AnyArray,
+    site_xmat: AnyArray,
+    qpos: AnyArray,
+    touch: AnyArray,
+    xp: ModuleType = np,
 ) -> Any:
     """Whether each slot's goal holds.
 
@@ -291,7 +300,14 @@ def evaluate(
 
 
 def predicates(
-    table: GoalTable, *, xpos: Any, site_xpos: Any, site_xmat: Any, qpos: Any, touch: Any, xp: Any = np
+    table: GoalTable,
+    *,
+    xpos: AnyArray,
+    site_xpos: AnyArray,
+    site_xmat: AnyArray,
+    qpos: AnyArray,
+    touch: AnyArray,
+    xp: ModuleType = np,
 ) -> Any:
     """Each predicate by itself, bool [n, P]; arguments as for :func:`evaluate`."""
     n = table.kind.shape[0]
@@ -320,33 +336,33 @@ def predicates(
     return result
 
 
-def _touching(table: GoalTable, touch: Any, slot: Any, xp: Any) -> Any:
+def _touching(table: GoalTable, touch: AnyArray, slot: AnyArray, xp: ModuleType) -> Any:
     if touch.shape[-1] == 0:
         return table.touch < 0
     return (table.touch < 0) | (touch[slot, xp.maximum(table.touch, 0)] > 0)
 
 
-def _joint_tests(table: GoalTable, qpos: Any, xp: Any) -> Any:
+def _joint_tests(table: GoalTable, qpos: AnyArray, xp: ModuleType) -> Any:
     n = table.kind.shape[0]
     value = table.joint_sign * qpos[xp.arange(n)[:, None, None], table.joint]
     return xp.where(table.joint_inclusive, value >= table.joint_bound, value > table.joint_bound)
 
 
-def _rotated(mat: Any, vector: Any, xp: Any) -> Any:
+def _rotated(mat: AnyArray, vector: AnyArray, xp: ModuleType) -> Any:
     """``mat @ vector``, [..., 3]; a GPU may multiply matrices in TF32, off by a millimetre, so JAX sums by hand."""
     if xp is np:
         return (mat @ vector[..., None])[..., 0]
     return xp.sum(mat * vector[..., None, :], axis=-1)
 
 
-def _in_region(pos: Any, frame_pos: Any, frame_mat: Any, size: Any, xp: Any) -> Any:
+def _in_region(pos: AnyArray, frame_pos: AnyArray, frame_mat: AnyArray, size: AnyArray, xp: ModuleType) -> Any:
     """Upstream's ``in_box``: an axis-aligned box around the rotated half extents."""
     extent = xp.abs(_rotated(frame_mat, size, xp))
-    below = xp.array([0.0, 0.0, _BOX_BELOW], dtype=extent.dtype)
+    below = xp.array([[[0.0, 0.0, _BOX_BELOW]]], dtype=extent.dtype)
     return xp.all((pos > frame_pos - extent - below) & (pos < frame_pos + extent), axis=-1)
 
 
-def _on_region(pos: Any, frame_pos: Any, frame_mat: Any, size: Any, xp: Any) -> Any:
+def _on_region(pos: AnyArray, frame_pos: AnyArray, frame_mat: AnyArray, size: AnyArray, xp: ModuleType) -> Any:
     """Upstream's ``under``: within the footprint, just above the region."""
     delta = _rotated(frame_mat, pos - frame_pos, xp)
     height = delta[..., 2]
@@ -355,7 +371,7 @@ def _on_region(pos: Any, frame_pos: Any, frame_mat: Any, size: Any, xp: Any) -> 
     return inside & (top - _REGION_BELOW < height) & (height < top + _REGION_ABOVE)
 
 
-def _on_object(pos: Any, reference: Any, xp: Any) -> Any:
+def _on_object(pos: AnyArray, reference: AnyArray, xp: ModuleType) -> Any:
     """Upstream's ``check_ontop`` of two objects, contact excluded."""
     gap = xp.sqrt(xp.sum((reference[..., :2] - pos[..., :2]) ** 2, axis=-1))
     return (reference[..., 2] <= pos[..., 2]) & (gap < ON_TOP_RADIUS)

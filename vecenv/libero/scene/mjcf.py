@@ -2,7 +2,7 @@
 
 LIBERO's assets are small MJCF files meant to be merged by robosuite 1.4.0. The functions here reproduce the *effect* of
 that merge (which element ends up where, under which name), so that a compiled model has upstream's bodies, joints and
-geoms in upstream's order. Nothing here knows about tasks.
+geoms in upstream's order. Nothing here depends on tasks.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SECTIONS = ("actuator", "sensor", "tendon", "equality", "contact")
 
 
 class MjcfError(InvalidInput):
-    """An asset file is not the MJCF that robosuite's conventions ask for; the message names the file."""
+    """An asset file does not follow robosuite's conventions for MJCF; the message names the file."""
 
 
 def load(path: Path) -> ET.Element:

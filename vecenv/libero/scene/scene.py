@@ -220,7 +220,7 @@ def compile_scene(
 
     Args:
         problem: a parsed LIBERO problem.
-        contact_pairs: pairs of objects and fixtures whose contacts goals ask for; each becomes a contact sensor.
+        contact_pairs: pairs of objects and fixtures whose contacts goals test; each becomes a contact sensor.
         visual: keep visual geoms, materials and textures. The physics does not depend on it.
         contacts: ``"published"``, those of the MuJoCo that LIBERO was made with, or ``"current"``.
 
@@ -381,7 +381,7 @@ def _find_region_site(tree: ET.Element, name: str, entity: str) -> RegionSite | 
 
 
 def _outer_site(source: ET.Element, name: str) -> tuple[float, float, float]:
-    """Position of a site beside an object's body, which tells its extent; zeros where the file has none."""
+    """Position of a site next to an object's body, which tells its extent; zeros where the file has none."""
     site = source.find(f"worldbody/body/site[@name='{name}']")
     return (0.0, 0.0, 0.0) if site is None else _vec3(site.attrib["pos"])
 

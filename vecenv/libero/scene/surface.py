@@ -1,4 +1,4 @@
-"""Surface samples of a scene's collision geometry: where things are, as a planner with ground truth sees them.
+"""Surface samples of a scene's collision geometry: the ground truth for planners.
 
 Points are drawn once a scene, deterministically, in body frames, spread evenly by area over the outer surface (what
 lies inside another geom of the same body is not surface). Moving them to the world is one matrix product a batch.
@@ -19,7 +19,7 @@ from vecenv.libero.scene.scene import Scene
 POINTS_PER_ENTITY = 320
 MIN_POINTS = 200
 _INSIDE = 1e-4
-# Points drawn for each point asked for, at first and at most; those inside another geom are thrown away.
+# Points drawn for each requested point, at first and at most; those inside another geom are discarded.
 _DRAWN_FIRST = 4
 _DRAWN_AT_MOST = 64
 _BOX_FACE_GRID = 7
@@ -85,7 +85,7 @@ def entity_corners(scene: Scene, name: str) -> BodyPoints:
 
 
 def box_samples(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A grid on the six faces of axis-aligned boxes, the cheap stand-in for a surface that some planners use.
+    """A grid on the six faces of axis-aligned boxes, the cheap approximation of a surface that some planners use.
 
     Args:
         low, high: corners, metres, [n, 3].

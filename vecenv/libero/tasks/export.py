@@ -235,7 +235,7 @@ class ExportedTask:
             )
         if contacts != self.folder.contacts:
             raise ExportError(
-                f"{self.folder.path}: exported with contacts={self.folder.contacts!r}, asked for {contacts!r}; use "
+                f"{self.folder.path}: exported with contacts={self.folder.contacts!r}, requested {contacts!r}; use "
                 f"that, or `vecenv compile --out DIR --contacts {contacts}` for a new folder"
             )
         return self.folder.scene(self.scene_ids[profile])
@@ -245,7 +245,7 @@ _parsed = functools.lru_cache(maxsize=512)(parse_problem)
 
 
 class ExportFolder:
-    """An exported folder, opened: its index is read and checked, scenes and starts are when asked for.
+    """An exported folder, opened: its index is read and checked at once, scenes and starts on access.
 
     Args:
         path: the folder.
@@ -280,7 +280,7 @@ class ExportFolder:
         return self._index[suite][1]
 
     def scene(self, key: str) -> Scene:
-        """A scene, the same object whenever the same id is asked for; raises `ExportError`."""
+        """A scene, the same object for the same id; raises `ExportError`."""
         if key not in self._scenes:
             try:
                 self._scenes[key] = read_scene(self.path / SCENES, key)
@@ -321,7 +321,7 @@ class ExportFolder:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ExportError(f"{path}: damaged: not the index of an export; {self._again}") from error
 
-    def _check_versions(self, layout: Any, version: Any) -> None:
+    def _check_versions(self, layout: object, version: object) -> None:
         if version != mujoco.__version__:
             raise ExportError(
                 f"{self.path}: exported with MuJoCo {version}, running {mujoco.__version__}: "

@@ -10,10 +10,10 @@ draws, in this order (robosuite 1.4.0, ``environments`` and ``robots``; LIBERO, 
    model load, that is at the construction of the environment and at every reset, and is drawn from end to end;
 3. the things on the table or floor, in the order of ``:init``: a rectangle of the region, x and y, again until nothing
    placed before is too near, then an angle about each axis;
-4. what stands on or lies in a region of another thing, then what stands on another thing, likewise.
+4. what stands on or lies in a region of another thing, then what stands on another thing.
 
-A reset that finds no room in 5,000 tries is given up, and the next one begins where the generator stopped.
-The generator is a ``RandomState`` of its own; the global one is neither read nor moved.
+A reset that finds no room in 5,000 tries is abandoned, and the next one begins where the generator stopped. The
+generator is a separate ``RandomState``; the global one is neither read nor advanced.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Pose: TypeAlias = tuple[np.ndarray, np.ndarray]
 """World position [3] in metres and quaternion wxyz [4]."""
 
 _TRIES = 5000
-# Upstream tries for ever; a task that fails this often has no room.
+# Upstream tries without limit; a task that fails this often has no room.
 _ATTEMPTS = 20
 _ARM_JOINTS = 7
 _ABOVE = 0.01
@@ -100,7 +100,7 @@ class Resets(Iterator[dict[str, Pose]]):
         unseeded: resets between the construction of the environment and the seed.
 
     Raises:
-        ResetError: ``:init`` asks for what upstream cannot do.
+        ResetError: ``:init`` has a predicate that upstream cannot set up.
     """
 
     def __init__(self, problem: Problem, scene: Scene, seed: int, *, unseeded: int = 0) -> None:
@@ -188,7 +188,7 @@ def placed_at(problem: Problem, scene: Scene, points: Sequence[ResetPoint]) -> l
     """What each of these resets places, by name; resets of one seed are replayed once.
 
     Raises:
-        ResetError: ``:init`` asks for what upstream cannot do.
+        ResetError: ``:init`` has a predicate that upstream cannot set up.
     """
     wanted: dict[tuple[int, int], set[int]] = {}
     for point in points:

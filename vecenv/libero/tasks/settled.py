@@ -1,7 +1,7 @@
 """Starts that have come to rest: every stored init state after ten idle control ticks under MuJoCo 3.3.0.
 
 Stored init states precede settling, and MuJoCo 3.4 and later settle some of them elsewhere than the version that
-LIBERO's published results used; what settled under 3.3.0 stays put under later versions. The arrays ship with the
+LIBERO's published results used; what settled under 3.3.0 stays at rest under later versions. The arrays ship with the
 package, one file a suite, and `scripts/settle_starts.py` recreates them. Fixtures stood at the centres of their
 regions.
 """
@@ -63,7 +63,7 @@ def read(folder: Path, spec: TaskSpec) -> SettledStarts:
 
 
 def digest(spec: TaskSpec) -> bytes:
-    """What ties settled starts to the init states they came from."""
+    """Checksum of the init states that settled starts were made from."""
     return hashlib.sha256(np.ascontiguousarray(spec.init_states()).tobytes()).digest()
 
 

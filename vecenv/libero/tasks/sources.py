@@ -1,7 +1,7 @@
 """Where an environment's tasks come from: the installed packages, or a folder that ``vecenv compile`` wrote.
 
-An environment asks a task for its goal, its starts and its scene through :class:`Task` and does not know which of the
-two it is: ``installed_tasks`` here reads the packages and compiles, ``vecenv.libero.tasks.export`` reads the folder.
+An environment gets a task's goal, starts and scene through :class:`Task`, which is the same for both:
+``installed_tasks`` here reads the packages and compiles, ``vecenv.libero.tasks.export`` reads the folder.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Task(Protocol):
 
     @property
     def instruction(self) -> str:
-        """What a policy is told."""
+        """The instruction that a policy receives."""
         ...
 
     def problem(self) -> Problem:

@@ -2,7 +2,7 @@
 
 Five suites are LIBERO's own, sixteen are LIBERO-PRO's perturbations of four of them. Names and order come from the
 installed task map, read as a syntax tree; task files and start states are read from disk on access, so listing is
-cheap and a damaged file only concerns who asks for it. Nothing is imported from `libero` or `robosuite`, nothing is
+cheap and a damaged file matters only to those who read it. Nothing is imported from `libero` or `robosuite`, nothing is
 unpickled.
 """
 
@@ -94,7 +94,7 @@ class TaskSpec:
 
     @property
     def instruction(self) -> str:
-        """What a policy is told.
+        """The instruction that a policy receives.
 
         The sentence in the task's name for LIBERO's own suites and for PRO's ``_object`` and ``_swap`` (upstream's
         ``task.language``, what policies were trained on). PRO's ``_lan`` and ``_task`` rewrite the instruction in the

@@ -1,1 +1,1 @@
-"""SIMPLER's asset files: what is needed, where it lies, how it is downloaded."""
+"""SIMPLER's asset files: which are needed, where they are, and their download."""

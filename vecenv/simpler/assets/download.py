@@ -89,7 +89,7 @@ def download(
         url: the file's address.
         part: partial file; the complete file when this returns.
         expected: what the content must be.
-        hosts: redirects may lead to these hosts and their subdomains, besides the address's own host.
+        hosts: redirects may lead to these hosts and their subdomains, and to the address's own host.
         policy: retries.
 
     Raises:

@@ -22,5 +22,5 @@ class ServerUnreachable(TransferError):
 
 
 def reason(error: BaseException) -> str:
-    """The message of an error, or its type where it has none."""
+    """The message of an error, or its type if the message is empty."""
     return str(error) or type(error).__name__

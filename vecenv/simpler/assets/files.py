@@ -1,4 +1,4 @@
-"""Where SIMPLER's meshes, images and robot descriptions are, which are missing, and what stands in for missing ones.
+"""Paths of SIMPLER's meshes, images and robot descriptions, and stand-ins for missing files.
 
 In: the asset tree, in upstream's own layout (``data/...`` and ``mani_skill2_real2sim/...`` of ManiSkill2_real2sim):
 the folder that ``VECENV_SIMPLER_ASSETS`` names, else the user's data folder, which ``vecenv assets pull simpler``
@@ -46,8 +46,8 @@ class Entry:
     Attributes:
         path: relative to the tree's root.
         size: bytes, None where the file could not be had when the list was made.
-        sha256: of its content, hexadecimal; likewise.
-        git_blob: Git's identifier of its content (SHA-1 of a header and the content); "" where not known.
+        sha256: of its content, hexadecimal; "" if not known.
+        git_blob: Git's identifier of its content (SHA-1 of a header and the content); "" if not known.
         used_by: the only file that needs it, None where the simulator opens it itself.
     """
 
@@ -59,7 +59,7 @@ class Entry:
 
     @property
     def key(self) -> str:
-        """What its content is known by."""
+        """Identifier of its content."""
         return self.sha256 or self.git_blob
 
     def matches(self, file: Path) -> bool:
@@ -120,7 +120,7 @@ def _entry(row: dict[str, object]) -> Entry:
 
 
 def safe_path(text: str) -> PurePosixPath:
-    """A relative path that stays where it is, with forward slashes.
+    """A relative path that does not leave its folder, with forward slashes.
 
     Raises:
         ManifestError: it is absolute, empty, or has parts like ``..``.
@@ -159,7 +159,7 @@ def simpler_root(given: str | Path | None = None) -> Path:
     """Root of the tree: ``given``, or ``default_root()``.
 
     Raises:
-        AssetsMissing: there is none.
+        AssetsMissing: there is no tree.
     """
     root = default_root() if given is None else Path(given).expanduser()
     absent = [marker for marker in _MARKERS if not (root / marker).is_dir()]
@@ -172,7 +172,7 @@ def simpler_root(given: str | Path | None = None) -> Path:
 
 
 def asset_row() -> AssetRow:
-    """One line for ``vecenv doctor``, never raising; ``stand_ins`` says what is missing from a tree that will do."""
+    """One row for ``vecenv doctor``; never raises. ``stand_ins`` lists the missing files of a usable tree."""
     try:
         root = simpler_root()
     except AssetsMissing as error:
@@ -181,7 +181,7 @@ def asset_row() -> AssetRow:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Files and what stands in for them.
+# Files and their stand-ins.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,13 +210,13 @@ class Resolved:
 
     @property
     def note(self) -> str:
-        """What to tell the user, "" when the file is there."""
+        """Note for the user, "" if the file exists."""
         return self.stand_in.note if self.stand_in else ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Table:
-    """Height of a stage's table, metres; ``proof``: how it is known."""
+    """Height of a stage's table, metres; ``proof``: the evidence for it."""
 
     top: float
     proof: str
@@ -231,14 +231,14 @@ _TABLES = {
 
 
 def resolve(name: str | PurePosixPath, root: Path | None = None) -> Resolved:
-    """A file of the tree, or what stands in for it.
+    """A file of the tree, or its stand-in.
 
     Args:
         name: path relative to the root.
         root: of the tree; ``simpler_root()`` by default.
 
     Raises:
-        AssetsMissing: the file is missing and nothing can stand in for it.
+        AssetsMissing: the file is missing and has no stand-in.
         ManifestError: the path leads out of the tree.
     """
     path, tree = safe_path(str(name)), root or simpler_root()
@@ -260,15 +260,15 @@ def collision_mesh(model: str, root: Path | None = None) -> Path:
     """Convex parts of an object.
 
     Raises:
-        AssetsMissing: the object has none.
+        AssetsMissing: the object has no collision mesh.
     """
     found = resolve(_MODELS / model / "collision.obj", root).path
-    assert found is not None  # nothing stands in for it, so it is there
+    assert found is not None  # it has no stand-in, so it exists
     return found
 
 
 def visual_mesh(model: str, root: Path | None = None) -> Resolved:
-    """What is drawn of an object: its textured mesh, or a stand-in.
+    """The rendered mesh of an object: its textured mesh, or a stand-in.
 
     Raises:
         AssetsMissing: the object has not even a collision mesh.
@@ -288,7 +288,7 @@ def stand_ins(root: Path | None = None) -> tuple[str, ...]:
 
 
 def stand_in_note(path: PurePosixPath, tree: Path) -> str:
-    """The note of what stands in for a missing file, "" where the file is there or nothing does."""
+    """The note of a missing file's stand-in, "" if the file exists or has no stand-in."""
     try:
         return resolve(path, tree).note
     except AssetsMissing:

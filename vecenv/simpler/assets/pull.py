@@ -86,7 +86,7 @@ class Report:
         fetched: files that were fetched.
         kept: files that were there and intact.
         missing: path -> why the file could not be fetched.
-        stand_ins: notes about what stands in for missing files.
+        stand_ins: notes about stand-ins for missing files.
         wanting: missing files that have no stand-in and that are needed.
     """
 
@@ -226,7 +226,7 @@ class _Pull:
             return self._take(OpenArchive(name, members, self._partial), wanted, threads=1)
 
     def _take(self, source: Source, wanted: Sequence[Entry], threads: int = _THREADS) -> list[Entry]:
-        """Fetch files from a source; returns those that it lacks. Files with the same content are fetched once."""
+        """Fetch files from a source; returns those that it does not have. Equal contents are fetched once."""
         by_content: dict[str, list[Entry]] = {}
         for entry in wanted:
             by_content.setdefault(entry.key, []).append(entry)

@@ -45,11 +45,11 @@ class Chain:
         width: N, columns of qpos.
         columns: which column of qpos each joint of the chain is, int [n].
         fixed_pos: from the previous joint's frame to the joint's at zero, metres, [n, 3].
-        fixed_rot: likewise, matrices [n, 3, 3].
+        fixed_rot: their rotations, matrices [n, 3, 3].
         axis: unit axes in the joint's own frame, [n, 3].
         slides: prismatic, bool [n].
         tip_pos: from the last joint's frame to the link, metres, [3].
-        tip_rot: likewise, [3, 3].
+        tip_rot: its rotation, [3, 3].
     """
 
     width: int

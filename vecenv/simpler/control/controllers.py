@@ -37,7 +37,7 @@ class SetPoints(NamedTuple):
 
     Attributes:
         position: set-point at the end of each substep, radians (WidowX's fingers: metres), [B, S, N].
-        velocity: rad/s or m/s, likewise; 0 where only positions are commanded.
+        velocity: rad/s or m/s, of the same shape; 0 where only positions are commanded.
         solved: the inverse kinematics found the pose, bool [B]; where it did not, the arm keeps its position.
     """
 

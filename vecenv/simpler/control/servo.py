@@ -67,14 +67,14 @@ class Servo:
         self._idle = np.zeros(controller.count, int)
 
     def forget(self, slots: np.ndarray) -> None:
-        """Slots (bool [B]) did something else, so their references mean nothing any more."""
+        """Discard the references of slots (bool [B]) that were driven otherwise."""
         self._known &= ~slots
 
     def begin(self, tool: np.ndarray) -> None:
-        """References begin at the tools' poses, [B, 7], world frame; those of an earlier call stay where they are.
+        """References begin at the tools' poses, [B, 7], world frame; those of an earlier call are kept.
 
-        The Google Robot's actions are relative to where its tool is, so without that it would yield, tick by tick, to
-        whatever presses on it while it holds still.
+        The Google Robot's actions are relative to the measured pose of its tool, so without a kept reference it would
+        drift, tick by tick, under a contact force while it holds still.
         """
         self._reference = np.where(self._known[:, None], self._reference, tool)
         self._known[:] = True

@@ -30,7 +30,7 @@ class Joint:
         parent: link it hangs on.
         child: link it carries.
         position: of the child's frame in the parent's at zero, metres, [3].
-        rotation: likewise, matrix [3, 3].
+        rotation: its rotation, matrix [3, 3].
         axis: unit axis in the child's frame, [3].
         limits: lowest and highest position, radians or metres.
     """
@@ -97,7 +97,7 @@ class Urdf:
 
         Args:
             link: its name.
-            order: names of the robot's moving joints, as they stand in the columns of qpos.
+            order: names of the robot's moving joints, in the order of the columns of qpos.
 
         Raises:
             KinematicsError: no such link, no moving joint above it, or one that ``order`` leaves out.

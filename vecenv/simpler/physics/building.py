@@ -41,7 +41,7 @@ class BuiltScene:
         system: the physics.
         sapien: the scene.
         robot: the robot.
-        cabinet: the cabinet with drawers, None where there is none.
+        cabinet: the cabinet with drawers, None if there is none.
         objects: entities of the objects, in the order of the spec.
         bodies: their dynamic bodies.
     """

@@ -35,7 +35,7 @@ class Scene:
     """One slot's scene.
 
     Args:
-        spec: what stands in it.
+        spec: its content.
         visuals: load what is drawn too (needs a renderer).
     """
 
@@ -134,7 +134,7 @@ class Scene:
 
         Args:
             targets: joint positions [substeps, dof].
-            velocities: joint velocities to aim at, likewise; None for zero.
+            velocities: target joint velocities, of the same shape; None for zero.
         """
         robot, step = self.robot.physx, self.system.step
         moving, stop = self._command(targets, velocities), self._stop_for(targets)

@@ -1,4 +1,4 @@
-"""What stands in a SIMPLER scene, where an episode starts, and what is measured after a control tick, as data.
+"""The content of a SIMPLER scene, the start of an episode, and the measurements after a control tick, as data.
 
 Poses are xyz + wxyz in the world frame, lengths metres, angles radians, impulses newton seconds. Nothing here knows
 tasks or needs SAPIEN.
@@ -79,7 +79,7 @@ class RobotBody:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectBody:
-    """A thing that lies in the scene.
+    """A movable object in the scene.
 
     Attributes:
         name: its name, unique in the scene.

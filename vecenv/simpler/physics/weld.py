@@ -158,7 +158,7 @@ def _freeze(links: Sequence[LinkBuilder], angles: Mapping[str, float]) -> None:
 def _parse(
     scene: sapien.Scene, urdf: Path, surfaces: Mapping[str, LinkSurface], many_hulls: bool, visuals: bool
 ) -> ArticulationBuilder:
-    # SAPIEN warns of every STL file with several hulls; upstream's robots have them, and silences it likewise.
+    # SAPIEN warns of every STL file with several hulls, which upstream's robots have; upstream silences it too.
     sapien.set_log_level("error")
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True

@@ -40,8 +40,8 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.errors import InvalidInput
 from vecenv.placement import Placement, PlacementError, cross
+from vecenv.protocols import ProtocolError
 from vecenv.simpler.layouts import Choices, Layout, drawn, episode_seed, lay_out, unseeded_seeds
 from vecenv.simpler.published.specs import (
     PROTOCOLS,
@@ -76,8 +76,8 @@ __all__ = [
 ]
 
 
-class PublishedError(InvalidInput):
-    """A protocol that does not exist, or a task that it has no episodes of; the message says what there is."""
+class PublishedError(ProtocolError):
+    """A protocol that does not exist, or a task without episodes under it; the message lists those that exist."""
 
 
 def episodes(protocol: str, task: str) -> Sequence[EpisodeSpec]:
@@ -117,7 +117,7 @@ def counts(protocol: str, suite: str) -> dict[int, int]:
     """Index of a task -> how many episodes a protocol has of it, for the tasks of a suite that it has episodes of.
 
     Raises:
-        PublishedError: no such protocol, or it has none of this suite.
+        PublishedError: no such protocol, or it has no episodes of this suite.
         UnknownSuite: no such suite.
     """
     found = {task.index: num_episodes(protocol, task.name) for task in list_tasks(suite)}
@@ -128,7 +128,7 @@ def counts(protocol: str, suite: str) -> dict[int, int]:
     return {index: count for index, count in found.items() if count}
 
 
-def place(protocol: str, suite: str, tasks: Any, episodes: Any) -> Placement:
+def place(protocol: str, suite: str, tasks: object, episodes: object) -> Placement:
     """Every chosen episode of every chosen task, task by task.
 
     Args:
@@ -164,7 +164,7 @@ def check_placement(protocol: str, suite: str, placement: Placement) -> Placemen
 
 
 def num_episodes(protocol: str, task: str) -> int:
-    """How many episodes of a task a protocol has, 0 where upstream has none; errors as of ``episodes``."""
+    """Number of episodes of a task under a protocol, 0 if upstream has none; errors as of ``episodes``."""
     return len(_rows(check_protocol(protocol), _task(task).name))
 
 
@@ -243,11 +243,11 @@ ROOMS: Mapping[str, StageSpec] = MappingProxyType(
         ),
     }
 )
-"""Rooms around variant aggregation's cabinets; they are drawn, nothing touches them."""
+"""Rooms around variant aggregation's cabinets; they are rendered and have no collision shapes."""
 
 
 def scene_of(spec: EpisodeSpec) -> tuple[SimplerTask, Layout]:
-    """The task, changed as the episode asks for, and the layout."""
+    """The task with the changes of the episode, and the layout."""
     task = replace(TASKS[spec.task], max_steps=spec.max_steps)
     if spec.protocol == VARIANT_AGGREGATION:
         task = _aggregated(task, spec)

@@ -15,7 +15,7 @@ def eval_metadata(suite: str, protocol: str = "seed") -> dict[str, Any]:
     Args:
         suite: the suite.
         protocol: one of ``published.PROTOCOLS``. Under upstream's lists ``episodes_per_task`` is a tuple, one number
-            per task, 0 where upstream has none.
+            per task, 0 if upstream has none.
 
     Raises:
         UnknownSuite: no such suite.

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.contract import RegionBox
 from vecenv.manipulation.world import HOME_ROTATION, SceneGeometry, down_facing, spun, yaw
+from vecenv.observations import RegionBox
 from vecenv_eval.policies.pick_place.motion import CLOSE, OPEN, Waypoint
 
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot, RegionBox
 from vecenv.manipulation.placing import Target
 from vecenv.manipulation.world import SceneGeometry
+from vecenv.observations import ObjectsSnapshot, RegionBox
 
 Predicate = tuple[str, ...]
 

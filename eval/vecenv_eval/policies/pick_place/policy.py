@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vecenv.contract import BatchEnv, ObjectsSnapshot, ResetInfo
+from vecenv.contract import BatchEnv, ResetInfo
 from vecenv.manipulation.placing import Grasped, choose_grasp
 from vecenv.manipulation.world import Margins, SceneGeometry
+from vecenv.observations import ObjectsSnapshot
 from vecenv_eval.policies.pick_place import fixtures, goals, transfer
 from vecenv_eval.policies.pick_place.fixtures import DrawerHandle
 from vecenv_eval.policies.pick_place.goals import Predicate

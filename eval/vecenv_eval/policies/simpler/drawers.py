@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.contract import Part, PartJoint
+from vecenv.observations import Part, PartJoint
 from vecenv.simpler.control.rotations import rotvec_from_rotation
 from vecenv_eval.policies.simpler.reach import Arm, Waypoint, pose, through
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.contract import PointCloud
+from vecenv.observations import PointCloud
 from vecenv.simpler.control.rotations import rotvec_from_rotation
 from vecenv_eval.policies.simpler.reach import Arm, Hand
 

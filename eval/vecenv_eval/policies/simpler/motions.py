@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from vecenv.contract import ObjectsSnapshot
+from vecenv.observations import ObjectsSnapshot
 from vecenv_eval.policies.simpler import drawers
 from vecenv_eval.policies.simpler.grasps import Grasp, choose
 from vecenv_eval.policies.simpler.reach import Arm, Waypoint, pose, through

@@ -3,16 +3,17 @@
 The method and the halved depth of face contacts are those of ``vecenv.libero.physics.colliders.boxbox``, which explains
 them. Here all candidates of a pair are computed at once and masked: 16 crossings of edges, 4 corners of the face, 4
 corners of the other box, for a face and for two edges. A pair has eight rows; those without a contact are ``NOTHING``
-metres apart. What single precision asks for is said in ``vecenv.libero.physics.colliders.boxbox_warp``.
+metres apart. ``vecenv.libero.physics.colliders.boxbox_warp`` explains what single precision requires.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mujoco import mjx
 
 MOST = 8
 # Distance of a row without a contact, metres.
@@ -47,6 +48,12 @@ class Box(NamedTuple):
     size: jax.Array
 
 
+class PairKey(Protocol):
+    """MJX's key of a group of geom pairs: ``data_ids`` are the meshes of the two geoms, -1 for other geoms."""
+
+    data_ids: tuple[int, int]
+
+
 class _Found(NamedTuple):
     """Candidates in a frame: positions [24, 3], depths [24], and which of them count."""
 
@@ -55,7 +62,7 @@ class _Found(NamedTuple):
     valid: jax.Array
 
 
-def collider(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def collider(model: mjx.Model, data: mjx.Data, key: PairKey, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """A collision function of MJX: distances [8 N], positions [8 N, 3], frames [8 N, 3, 3] of pairs of geoms [N, 2]."""
     first, second = (Box(data.geom_xpos[g], data.geom_xmat[g], model.geom_size[g]) for g in geom.T)
     margin = model.geom_margin[geom].sum(-1)
@@ -123,7 +130,7 @@ def _good(points: jax.Array, first: Box, second: Box, margin: jax.Array | float)
 
 
 def _repeated(points: jax.Array, valid: jax.Array) -> jax.Array:
-    """Points that come again among the later valid ones, bool [24]."""
+    """Points that are repeated among the later valid ones, bool [24]."""
     again = (points[:, None] == points[None]).all(-1)
     return (jnp.triu(again, 1) & valid).any(-1)
 
@@ -143,7 +150,7 @@ def _times(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def _turn(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """A matrix times a vector, likewise."""
+    """A product of a matrix and a vector, in full precision on every device."""
     return (matrix * vector).sum(-1)
 
 
@@ -154,7 +161,7 @@ def _one_of(constants: np.ndarray, index: jax.Array) -> jax.Array:
 
 
 def _safe(value: jax.Array, fine: jax.Array) -> jax.Array:
-    """A number to divide by or to take the root of; 1 where it is not fine."""
+    """A number to divide by or to take the root of; 1 where it is not usable."""
     return jnp.where(fine, value, 1)
 
 
@@ -174,7 +181,7 @@ def _least_overlap(
     turned = jnp.abs(rot)
     overlap1 = size1 + (turned * size2).sum(1) - jnp.abs(centre2)
     overlap2 = size2 + (turned * size1[:, None]).sum(0) - jnp.abs(centre1)
-    faces = jnp.stack([overlap1, overlap2], 1).reshape(-1)  # in MuJoCo's order, in which the first of equals wins
+    faces = jnp.stack([overlap1, overlap2], 1).reshape(-1)  # in MuJoCo's order: the first of equals is chosen
     best = jnp.argmin(faces)
     centres = jnp.stack([centre2, centre1], 1).reshape(-1)
     face = best // 2 + 6 * (best % 2) + 3 * _one_row(centres < 0, best)
@@ -344,7 +351,7 @@ def _edge_lines(
 def _edge_corners(
     quad: jax.Array, flat: jax.Array, half: jax.Array, crossed: jax.Array, margin: jax.Array | float
 ) -> _Found:
-    """The rectangle's corners inside the projected face, or beside it where no side crosses the rectangle."""
+    """The rectangle's corners inside the projected face, or next to it where no side crosses the rectangle."""
     first, second = flat[1] - flat[0], flat[2] - flat[0]
     # MuJoCo 3.3.0 divides by the last corner's squared gap from the second corner on, see
     # ``vecenv.libero.physics.colliders.boxbox``.

@@ -386,7 +386,7 @@ def _edge_lines(quad: Array, flat_quad: Array, half: Array, rise: float, margin:
 def _edge_corners(
     quad: Array, flat_quad: Array, half: Array, margin: float, lines: int, found: Candidates, count: int
 ) -> int:
-    """The rectangle's corners inside the projected face, or beside it where no side crosses the rectangle."""
+    """The rectangle's corners inside the projected face, or next to it where no side crosses the rectangle."""
     points, depth, _ = found
     a, b = flat_quad[1, 0] - flat_quad[0, 0], flat_quad[2, 0] - flat_quad[0, 0]
     c, d = flat_quad[1, 1] - flat_quad[0, 1], flat_quad[2, 1] - flat_quad[0, 1]

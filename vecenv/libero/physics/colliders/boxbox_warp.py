@@ -1,12 +1,12 @@
 """Contacts of two boxes as MuJoCo 2.3 to 3.3 computed them, as a Warp function for CUDA and the CPU.
 
 Method, order of the contacts and halved depth of face contacts are those of ``vecenv.libero.physics.colliders.boxbox``,
-which explains them; signature and result are those of MuJoCo Warp's own ``box_box``, in whose place it is called
+which explains them; signature and result are those of MuJoCo Warp's own ``box_box``, which it replaces
 (``vecenv.libero.physics.mjx.contacts``). Everything is float32, in the world frame, metres.
 
-Single precision asks for one difference. An axis made of two nearly parallel edges is known only as well as the cross
-product of the edges, and where boxes rest flat on each other its overlap ties with that of a face: it has to win by
-more than what rounding makes of it.
+Single precision requires one difference. An axis made of two nearly parallel edges is only as accurate as the cross
+product of the edges, and where boxes rest flat on each other its overlap ties with that of a face: it is chosen only if
+its overlap is smaller by more than the rounding error.
 """
 
 # In Warp, int(0) makes a variable that a loop may change; a literal is a constant.
@@ -24,7 +24,7 @@ from vecenv.libero.physics.private import mat83f, vec8f
 MOST = 8
 # Squared sine below which the cross product of two edges is noise.
 PARALLEL = 1e-10
-# What an edge axis has to win by, times the boxes' size over the sine between the edges.
+# Margin by which an edge axis must be better, times the boxes' size over the sine between the edges.
 EDGE_NOISE = 5e-8
 _TINY = 1e-12
 _OUTSIDE = 1.01
@@ -406,7 +406,7 @@ def _edge_lines(found: Candidates, quad: Corners, flat_quad: Corners, half: wp.v
 
 @wp.func
 def _edge_corners(found: Candidates, lines: int, quad: Corners, flat_quad: Corners, half: wp.vec3, margin: float):
-    """The rectangle's corners inside the projected face, or beside it where no side crosses the rectangle."""
+    """The rectangle's corners inside the projected face, or next to it where no side crosses the rectangle."""
     longer = found
     count = int(lines)
     first = flat_quad[1] - flat_quad[0]

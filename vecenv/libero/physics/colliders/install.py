@@ -1,4 +1,4 @@
-"""Published contacts inside MuJoCo: our colliders in its collision table, for models that ask for them.
+"""Published contacts inside MuJoCo: our colliders in its collision table, used for models with the mark.
 
 MuJoCo calls the collider of two geoms through a table of function pointers, ``mjCOLLISIONFUNC``. The table belongs to
 the whole process, so its entries for two boxes and for a mesh on a plane become functions that look at the model first:
@@ -14,8 +14,9 @@ from __future__ import annotations
 import ctypes
 import functools
 import threading
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import llvmlite.binding as llvm
 import mujoco
@@ -23,11 +24,23 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.base import BaseContext
+from numba.core.types import Type
+from numba.core.typing.context import Context as TypingContext
+from numba.core.typing.templates import Signature
 
 from vecenv.errors import SimulationError
 from vecenv.libero.physics.colliders import boxbox, boxbox_numba, planemesh
 from vecenv.libero.scene.contacts import MARK, mark
-from vecenv.util.compiled import address_at, compile_for_c, floats_at, int32_at, intrinsic_with_literals, part
+from vecenv.util.compiled import (
+    Intrinsic,
+    address_at,
+    compile_for_c,
+    floats_at,
+    int32_at,
+    intrinsic_with_literals,
+    part,
+)
 
 _PLANE, _BOX, _MESH = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "BOX", "MESH"))
 _GEOM_TYPES = int(mujoco.mjtGeom.mjGEOM_SDF) + 1
@@ -35,6 +48,7 @@ _GEOM_TYPES = int(mujoco.mjtGeom.mjGEOM_SDF) + 1
 _REACH = 1_000_000
 # Numeric values of the probe: a number that none of its other sizes has.
 _PROBE_NUMERICS = 431
+_Unsigned: TypeAlias = ctypes.c_uint32 | ctypes.c_uint64
 _SYMBOL = "vecenv_collider_layout"
 _LOCK = threading.Lock()
 
@@ -93,7 +107,7 @@ def _unsupported(found: str) -> ColliderError:
     )
 
 
-def _table() -> Any:
+def _table() -> ctypes.Array[ctypes.Array[ctypes.c_void_p]]:
     """MuJoCo's table of collision functions, [type, type]."""
     folder = Path(mujoco.__file__).parent
     names = [*folder.glob("libmujoco*.so*"), *folder.glob("libmujoco*.dylib"), *folder.glob("mujoco.dll")]
@@ -141,7 +155,7 @@ def _offsets() -> list[int]:
     return found
 
 
-def _find(start: int, value: int, name: str, kind: Any) -> int:
+def _find(start: int, value: int, name: str, kind: type[_Unsigned]) -> int:
     """Bytes from ``start`` to the field that holds a value; nothing after it is read."""
     width = ctypes.sizeof(kind)
     for offset in range(0, _REACH, width):
@@ -195,10 +209,10 @@ def _compiled() -> tuple[Any, Any]:
 
 
 @intrinsic_with_literals
-def _layout(typingctx: Any, index: Any) -> Any:
+def _layout(typingctx: TypingContext, index: Type) -> Intrinsic:
     """An entry of ``_LAYOUT``."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def codegen(context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]) -> Any:
         kind = ir.IntType(64)
         variable = builder.module.globals.get(_SYMBOL) or ir.GlobalVariable(builder.module, kind, _SYMBOL)
         variable.linkage = "external"
@@ -208,10 +222,10 @@ def _layout(typingctx: Any, index: Any) -> Any:
 
 
 @intrinsic_with_literals
-def _call(typingctx: Any, function: Any, arguments: Any) -> Any:
+def _call(typingctx: TypingContext, function: Type, arguments: Type) -> Intrinsic:
     """Call a C function that returns an int32 by its address, with a tuple of arguments."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def codegen(context: BaseContext, builder: ir.IRBuilder, signature: Signature, args: Sequence[ir.Value]) -> Any:
         values = cgutils.unpack_tuple(builder, args[1])
         kind = ir.FunctionType(ir.IntType(32), [value.type for value in values])
         return builder.call(builder.inttoptr(args[0], kind.as_pointer()), values)
@@ -220,7 +234,7 @@ def _call(typingctx: Any, function: Any, arguments: Any) -> Any:
 
 
 @part
-def _is_marked(model: Any) -> bool:
+def _is_marked(model: int) -> bool:
     """Whether the first custom number of a model is the mark."""
     if int32_at(model + _layout(_NUM_NUMERIC)) < 1:
         return False
@@ -228,12 +242,12 @@ def _is_marked(model: Any) -> bool:
 
 
 @part
-def _row(owner: Any, field: Any, row: Any, width: Any) -> Any:
+def _row(owner: int, field: int, row: int, width: int) -> int:
     """Address of a row of a field; ``width`` is its size in bytes."""
     return address_at(owner + _layout(field)) + types.uintp(width * row)
 
 
-def _box_box(model: Any, data: Any, rows: Any, geom1: Any, geom2: Any, margin: Any) -> Any:
+def _box_box(model: int, data: int, rows: int, geom1: int, geom2: int, margin: float) -> int:
     """MuJoCo's collider of two boxes: writes contacts to ``rows`` and returns how many."""
     if not _is_marked(model):
         return _call(_layout(_BOXES), (model, data, rows, geom1, geom2, margin))
@@ -242,8 +256,8 @@ def _box_box(model: Any, data: Any, rows: Any, geom1: Any, geom2: Any, margin: A
     return _call(_layout(_OUR_BOXES), (*first, *second, margin, rows))
 
 
-def _plane_mesh(model: Any, data: Any, rows: Any, geom1: Any, geom2: Any, margin: Any) -> Any:
-    """MuJoCo's collider of a mesh on a plane, likewise."""
+def _plane_mesh(model: int, data: int, rows: int, geom1: int, geom2: int, margin: float) -> int:
+    """MuJoCo's collider of a mesh on a plane: writes contacts to ``rows`` and returns how many."""
     mesh = int32_at(_row(model, _GEOM_DATAID, geom2, 4))
     graph = int32_at(_row(model, _GRAPHADR, mesh, 4)) if mesh >= 0 else -1
     if graph < 0 or not _is_marked(model):

@@ -14,6 +14,7 @@ import functools
 import math
 from typing import Any
 
+import numpy as np
 from numba import types
 
 from vecenv.util.compiled import carray, compile_for_c, floats_at, int32s_at, part, singles_at, stack_array
@@ -32,8 +33,16 @@ def compiled() -> Any:
 
 
 def _collide(
-    plane_pos: Any, plane_mat: Any, pos: Any, mat: Any, vertices: Any, graph: Any, radius: Any, margin: Any, rows: Any
-) -> Any:
+    plane_pos: int,
+    plane_mat: int,
+    pos: int,
+    mat: int,
+    vertices: int,
+    graph: int,
+    radius: float,
+    margin: float,
+    rows: int,
+) -> int:
     """Write contacts to ``rows`` [3, 10] and return their number.
 
     Args:
@@ -68,7 +77,7 @@ def _collide(
 
 
 @part
-def _lowest(hull: Any, count: Any, points: Any, down: Any) -> Any:
+def _lowest(hull: np.ndarray, count: int, points: np.ndarray, down: np.ndarray) -> Any:
     """Number of the hull's vertex furthest along a direction, reached from the first along its edges."""
     best, height, climbing = 0, _along(points, hull[2 + count], down), True
     while climbing:
@@ -83,22 +92,22 @@ def _lowest(hull: Any, count: Any, points: Any, down: Any) -> Any:
 
 
 @part
-def _along(points: Any, vertex: Any, down: Any) -> Any:
+def _along(points: np.ndarray, vertex: int, down: np.ndarray) -> float:
     return down[0] * points[vertex, 0] + down[1] * points[vertex, 1] + down[2] * points[vertex, 2]
 
 
 @part
 def _contact(
-    points: Any,
-    vertex: Any,
-    turn: Any,
-    at: Any,
-    own: Any,
-    centre: Any,
-    found: Any,
-    row: Any,
-    apart: Any,
-    margin: Any,
+    points: np.ndarray,
+    vertex: int,
+    turn: np.ndarray,
+    at: np.ndarray,
+    own: np.ndarray,
+    centre: np.ndarray,
+    found: np.ndarray,
+    row: int,
+    apart: float,
+    margin: float,
 ) -> bool:
     """Write a vertex's contact to a row, if it is within the margin and far enough from the first contact."""
     place = carray(stack_array(3), (3,))

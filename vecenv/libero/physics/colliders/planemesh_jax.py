@@ -1,7 +1,7 @@
 """Contacts of a mesh on a plane as MuJoCo 2.3 to 3.3 chose them, in JAX, for ``jit``, ``vmap`` and ``grad``.
 
-The method is that of ``vecenv.physics.planemesh``. A pair has three rows; those without a contact are ``NOTHING``
-metres apart. Only the choice of the lowest vertex loops; derivatives do not go through it.
+The method is that of ``vecenv.libero.physics.colliders.planemesh``. A pair has three rows; those without a contact are
+``NOTHING`` metres apart. Only the choice of the lowest vertex loops; derivatives do not go through it.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+from mujoco import mjx
 
-from vecenv.libero.physics.colliders.boxbox_jax import NOTHING, contact_frame
+from vecenv.libero.physics.colliders.boxbox_jax import NOTHING, PairKey, contact_frame
 
 MOST = 3
 _APART = 0.3
@@ -26,7 +28,7 @@ class Hull(NamedTuple):
     neighbours: np.ndarray
 
 
-def hull_of(model: Any, mesh: int) -> Hull | None:
+def hull_of(model: mujoco.MjModel | mjx.Model, mesh: int) -> Hull | None:
     """The hull of a mesh of a model, MuJoCo's or MJX's; None where it has none."""
     start = int(model.mesh_graphadr[mesh])
     if start < 0:
@@ -48,7 +50,9 @@ def collider(without_hull: Callable[..., Any]) -> Callable[..., Any]:
         without_hull: MJX's own, of which meshes without a hull get the three deepest contacts.
     """
 
-    def collide(model: Any, data: Any, key: Any, geom: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def collide(
+        model: mjx.Model, data: mjx.Data, key: PairKey, geom: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         hull = hull_of(model, key.data_ids[1])
         if hull is None:
             return _deepest(without_hull(model, data, key, geom), len(geom))

@@ -1,7 +1,7 @@
 """The MJX backend: a batch of worlds behind the interface of ``vecenv.libero.physics.base``.
 
 In: scenes made ready (``Build``), which scene each slot runs, start states, goals, and actions or plans. Out: the state
-of every slot as NumPy arrays, fetched from the device when asked for. Chunks of actions and plans of waypoints run in
+of every slot as NumPy arrays, fetched from the device on access. Chunks of actions and plans of waypoints run in
 one compiled call a scene.
 """
 
@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import numpy.typing as npt
 from jax.sharding import Mesh
 from mujoco import mjx
 
@@ -25,11 +26,12 @@ from vecenv.libero.physics.mjx.programs import programs_of
 from vecenv.libero.physics.mjx.rollout import Loop, Trace
 from vecenv.libero.physics.mjx.step import World, fault_text
 from vecenv.libero.scene import goals
+from vecenv.util.arrays import AnyArray
 from vecenv.util.devices import replicated
 
 
 class MjxGroup:
-    """The slots of one scene on the device; NumPy copies are fetched when asked for."""
+    """The slots of one scene on the device; NumPy copies are fetched on access."""
 
     def __init__(self, built: Build, slots: np.ndarray, mesh: Mesh | None) -> None:
         self.scene, self.slots, self.built = built.scene, slots, built
@@ -50,7 +52,7 @@ class MjxGroup:
         """Replace the batch after a call."""
         self.worlds, self._fresh, self._fetched = worlds, None, {}
 
-    def put(self, array: Any) -> jax.Array:
+    def put(self, array: npt.ArrayLike) -> jax.Array:
         """Rows of slots as rows of worlds on the device: floats (32 bits unless x64 is on), int32 or bool."""
         array = np.asarray(array)
         missing = self.num_worlds - len(self.slots)
@@ -63,7 +65,7 @@ class MjxGroup:
         """Which slots take part, bool [n]; worlds past the last slot never do."""
         return jnp.asarray(np.concatenate([mask, np.zeros(self.num_worlds - len(self.slots), bool)]))
 
-    def get(self, array: Any) -> np.ndarray:
+    def get(self, array: AnyArray) -> np.ndarray:
         """Rows of the slots as a NumPy array."""
         return np.asarray(array)[: len(self.slots)]
 
@@ -136,7 +138,7 @@ class MjxGroup:
         self._fresh, self._fetched = self.compiled.forward(self.system, self.worlds), {}
 
 
-class MjxPhysics(Physics):
+class MjxPhysics(Physics[MjxGroup]):
     """A batch of worlds on MJX, slots in the caller's order.
 
     Args:

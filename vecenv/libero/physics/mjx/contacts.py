@@ -1,4 +1,4 @@
-"""Published contacts inside MJX: our colliders among those of MJX and MuJoCo Warp, for models that ask for them.
+"""Published contacts inside MJX: our colliders among those of MJX and MuJoCo Warp, used for models with the mark.
 
 MJX finds the collider of two geoms in a table, as MuJoCo does. The tables and functions of MJX's private modules
 (``private``) stay as they are. Marked models run copies of the functions, which read a table with our colliders
@@ -29,7 +29,7 @@ from vecenv.libero.physics.colliders import boxbox_jax, planemesh_jax
 from vecenv.libero.physics.private import jax_collision_driver
 from vecenv.libero.scene.contacts import MARK, MESH_MARGIN
 
-# The bit of a Warp model's disable flags that asks for published contacts.
+# The bit of a Warp model's disable flags that selects published contacts.
 PUBLISHED = 1 << 30
 # MuJoCo Warp sends boxes to its table of primitive colliders only where this flag is set; it means nothing else there.
 _BOXES_ARE_PRIMITIVE = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
@@ -41,7 +41,7 @@ class MjxContactsError(SimulationError):
 
 
 def put_model(model: mujoco.MjModel, *, impl: str) -> mjx.Model:
-    """``mjx.put_model`` with the contacts that the model's custom number asks for, see
+    """``mjx.put_model`` with the contacts that the model's custom number selects, see
     ``vecenv.libero.scene.contacts``.
 
     Args:
@@ -49,7 +49,7 @@ def put_model(model: mujoco.MjModel, *, impl: str) -> mjx.Model:
         impl: ``"jax"`` or ``"warp"``.
 
     Raises:
-        MjxContactsError: the model asks for published contacts, and the installed MJX is not a supported one.
+        MjxContactsError: the model needs published contacts, and the installed MJX is not a supported one.
     """
     if not _is_marked(model):
         return mjx.put_model(model, impl=impl)
@@ -69,7 +69,7 @@ def _without_mesh_margins(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def _is_marked(model: Any) -> bool:
+def _is_marked(model: mujoco.MjModel | mjx.Model) -> bool:
     """Whether the first custom number of a model, MuJoCo's or MJX's, is the mark."""
     return len(model.numeric_data) > 0 and float(model.numeric_data[0]) == MARK
 
@@ -99,7 +99,7 @@ def _expect(function: Any, arguments: str, *names: str) -> types.FunctionType:
     return plain
 
 
-def _copy_with(function: types.FunctionType, name: str, **replaced: Any) -> types.FunctionType:
+def _copy_with(function: types.FunctionType, name: str, **replaced: object) -> types.FunctionType:
     """A copy of a function in which some of its global names have other values."""
     copied = types.FunctionType(function.__code__, {**function.__globals__, **replaced}, name, function.__defaults__)
     copied.__annotations__, copied.__doc__ = dict(function.__annotations__), function.__doc__
@@ -111,7 +111,7 @@ def _dispatch(published: Callable[..., Any], current: Callable[..., Any], is_mar
     """A function of a model that calls ``published`` if the model is marked, else ``current``."""
 
     @functools.wraps(current)
-    def chosen(model: Any, *args: Any, **kwargs: Any) -> Any:
+    def chosen(model: object, *args: object, **kwargs: object) -> Any:
         return (published if is_marked(model) else current)(model, *args, **kwargs)
 
     return chosen
@@ -146,7 +146,7 @@ def _warp_driver() -> Any:
         raise _unsupported(str(error)) from error
 
 
-def _has_bit(model: Any) -> bool:
+def _has_bit(model: mjx.Model) -> bool:
     """Whether a model of MuJoCo Warp, or an MJX model for it, has the mark of published contacts."""
     return bool(int(model.opt.disableflags) & PUBLISHED)
 

@@ -59,7 +59,7 @@ _CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 
 @functools.cache
 def _knows_cpu_options() -> bool:
-    """Whether this jaxlib knows the options."""
+    """Whether this jaxlib accepts the options."""
     cpu = jax.devices("cpu")[0]
     try:
         jax.jit(lambda x: x, compiler_options=_CPU_OPTIONS)(jax.device_put(np.zeros(1), cpu))

@@ -6,7 +6,7 @@ took and whether its goal held. Worlds stop one by one; a loop ends when none mo
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,7 +113,7 @@ def follow_plan(
         plan: T waypoints a world.
         active: worlds that take part, bool [n].
         limit: control steps each world may still take, int [n].
-        max_misses: waypoints in a row that may run out of ticks before a world gives up.
+        max_misses: waypoints in a row that may time out before a world stops.
         sites: ids of the grip site and the hand body.
         config: tolerances and speeds.
         traced: ticks to record.
@@ -126,7 +126,9 @@ def follow_plan(
     def moving(loop: Loop, progress: waypoint.Progress) -> jax.Array:
         return loop.going & waypoint.unfinished(plan, progress) & (progress.misses < max_misses)
 
-    def body(carry: Any) -> Any:
+    def body(
+        carry: tuple[Loop, waypoint.Progress, Trace, jax.Array],
+    ) -> tuple[Loop, waypoint.Progress, Trace, jax.Array]:
         loop, progress, trace, count = carry
         moved = moving(loop, progress)
         actions, progress = waypoint.plan_action(plan, progress, eef(loop.worlds, *sites), config)

@@ -38,7 +38,7 @@ def block(solids: Sequence[Solid], up: int | None = None) -> Solid:
     """One box with the height of the solids along an axis of their body and the area of their outline seen along it.
 
     Args:
-        solids: what it stands for.
+        solids: the solids that it replaces.
         up: index of the body's axis, 0 to 2; None for the axis across which the outline fills its box best.
     """
     around = bound(solids, None if up is None else upright(largest(solids).mat, up))
@@ -128,7 +128,7 @@ def column(solids: Sequence[Solid], up: int, blades: int = 2) -> list[Solid]:
     directions, and flat on top and bottom.
 
     Args:
-        solids: what it stands for.
+        solids: the solids that it replaces.
         up: index of the body's axis along the column.
         blades: boxes; their polygon has ``4 * blades`` sides.
     """

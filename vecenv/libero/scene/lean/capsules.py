@@ -33,8 +33,8 @@ def end_capsule(solids: Sequence[Solid], end: np.ndarray, inner: np.ndarray | No
     Where the end is an edge (a palm) the capsule lies along it; where it is a tip (a finger) it runs to the other end.
 
     Args:
-        solids: what it stands for.
-        end: direction in which the end lies, along an axis of the body, [3].
+        solids: the solids that it replaces.
+        end: direction of the end, along an axis of the body, [3].
         inner: likewise a side with which a finger is flush all along; None for its middle.
     """
     points = np.concatenate([solid.extreme_points() for solid in solids])

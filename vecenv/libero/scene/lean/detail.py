@@ -1,7 +1,7 @@
-"""Levels of detail of things: parts, modules, and what each kind of thing offers for what tasks ask of it.
+"""Levels of detail of things: parts, modules, and the levels that each kind of thing offers for its uses.
 
 In: what tasks do with a thing (``vecenv.libero.scene.lean.geometry.demands``). Out: modules, each a ladder of levels
-from coarse to fine; a level is a list of parts, a part names upstream's collision geoms and the fit that stands for
+from coarse to fine; a level is a list of parts, a part names upstream's collision geoms and the fit that replaces
 them. Geoms are called what upstream's files call them after the thing's own name (``g18``).
 """
 
@@ -17,11 +17,11 @@ from vecenv.libero.scene.lean.fits import Around, Copy, Fit, Storey
 
 @dataclass(frozen=True)
 class Part:
-    """Geoms of one body and the fit that stands for them.
+    """Geoms of one body and the fit that replaces them.
 
     Attributes:
         fit: the fit.
-        geoms: the geoms' names after ``{entity}_``, in the order in which the fit wants them; empty for all of the
+        geoms: the geoms' names after ``{entity}_``, in the order that the fit expects; empty for all of the
             body's.
         body: the body's name after ``{entity}_``; None for the first one with collision geoms.
         meets: what it collides with, a row of ``vecenv.libero.scene.lean.geometry``'s table; "" for what its kind does.
@@ -69,7 +69,7 @@ class Recipe:
     held: int = 0
 
     def modules(self, asked: frozenset[str]) -> tuple[Module, ...]:
-        """Its one module, given what is asked of it."""
+        """Its one module, for these uses."""
         needed = bool(asked)
         used = "held" in asked or any(what.startswith("filled") for what in asked)
         return (Module(self.levels, self.held if used else 0, needed),)
@@ -121,7 +121,7 @@ class Cabinet:
     side_walls: tuple[tuple[str, ...], ...]
 
     def modules(self, asked: frozenset[str]) -> tuple[Module, ...]:
-        """Frame and drawers, given what is asked of them."""
+        """Frame and drawers, for these uses."""
         hollow = [bool({f"filled:{d.region}", f"open:{d.region}"} & asked) for d in self.drawers]
         worked = [f"worked:{d.region}" in asked for d in self.drawers]
         blocks = self._blocks(hollow)
@@ -163,7 +163,7 @@ class Jointed:
     moving: tuple[Level, ...]
 
     def modules(self, asked: frozenset[str]) -> tuple[Module, ...]:
-        """Body and moving part, given what is asked of them."""
+        """Body and moving part, for these uses."""
         inside = any(what.startswith("filled") for what in asked)
         worked = any(what.startswith("worked") for what in asked)
         return (

@@ -1,4 +1,4 @@
-"""Ways to stand for solids with fewer of them, as values: which formula, with which numbers.
+"""Ways to replace solids by fewer of them, as values: which formula, with which numbers.
 
 A recipe (``vecenv.libero.scene.lean.recipes``) names one of these for each part of a thing; the formulas are in
 ``boxes``, ``vessels`` and ``capsules``.
@@ -17,7 +17,7 @@ from vecenv.libero.scene.lean.solids import FitError, Solid, box
 
 
 class Fit(Protocol):
-    """A way to stand for solids with fewer of them."""
+    """A way to replace solids by fewer of them."""
 
     @property
     def count(self) -> int:

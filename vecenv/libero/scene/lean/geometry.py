@@ -2,9 +2,9 @@
 
 In: a scene's source and what its tasks do with its things. Out: a compiled scene with the same bodies, joints, sites,
 masses, inertias, actuators and sensors, bit for bit, but other collision geoms. MJX evaluates every pair of geoms that
-could collide, so their number decides what a step costs. How much detail a thing gets depends on what tasks do with it:
-what is picked up or filled stays as it must be, more detail goes to what is needed while the budget lasts, bystanders
-become one or two boxes. The shapes are data (``vecenv.libero.scene.lean.recipes``), the fits are in
+could collide, so their number decides what a step costs. How much detail a thing gets depends on its use in the tasks:
+what is picked up or filled gets the shape that this needs, then more detail while the budget lasts; bystanders become
+one or two boxes. The shapes are data (``vecenv.libero.scene.lean.recipes``), the fits are in
 ``vecenv.libero.scene.lean.fits``. The result is a pure function of the source and :func:`demands`;
 :func:`lean_key` names what else it depends on.
 """
@@ -30,13 +30,14 @@ from vecenv.libero.scene.lean.solids import Solid
 from vecenv.libero.scene.scene import Entity, Scene, SceneError, SceneSource
 
 PROFILES = ("exact", "lean")
-# Raised whenever the same source and demands give another lean scene.
+# Increased whenever the same source and demands give another lean scene.
 VERSION = 2
 MAX_GEOMS = 24
 
-# What may collide with what, as bits of contype and conaffinity. Parts of the surroundings never meet each other, but
-# for a drawer's front and the cabinet's frame that stops it; nor do parts of the robot, but for the two pads. Pads meet
-# what they can take hold of: elsewhere the fingers, which enclose them, are enough. The arm meets surroundings only.
+# What may collide with what, as bits of contype and conaffinity. Parts of the surroundings do not collide with each
+# other, except a drawer's front with the cabinet's frame that stops it; nor do parts of the robot, except the two pads.
+# Pads collide with what they can grasp; for the rest, the fingers that enclose them are enough. The arm collides with
+# surroundings only.
 _SCENERY, _OBJECT, _PAD, _STOP, _MOVING = 1, 2, 4, 8, 16
 _BITS = {
     "scenery": (_SCENERY, 0),
@@ -56,7 +57,7 @@ Demands: TypeAlias = Mapping[str, frozenset[str]]
 
 
 def demands(problems: Iterable[Problem]) -> Demands:
-    """What tasks ask of each object and fixture, by name; what nothing is asked of is left out.
+    """How tasks use each object and fixture, by name; those that no task uses are left out.
 
     ``held``: it is put somewhere. ``bears``: something is put or lies on it. ``filled:<region>``: something is put or
     lies in that region. ``worked:<region>``: the region's door or drawer, or with no region the thing's own joint, is
@@ -117,7 +118,7 @@ class Plan:
     Attributes:
         parts: the parts of each thing, by name; the robot's under ``ROBOT``.
         count: geoms at most, the support of everything included.
-        short: things that got less than the tasks want.
+        short: things that got less detail than the tasks need.
     """
 
     parts: Mapping[str, tuple[Part, ...]]
@@ -183,7 +184,7 @@ def lean_scene(source: SceneSource, asked: Demands, exact: Scene | None = None) 
     Args:
         source: the scene's source.
         asked: what the tasks do with its things, see :func:`demands`.
-        exact: ``source.compile()``, when it is at hand.
+        exact: ``source.compile()``, if already compiled.
 
     Raises:
         SceneError: MuJoCo refuses the model, or a thing does not look as its recipe expects.
@@ -242,7 +243,7 @@ def _part_geoms(model: mujoco.MjModel, name: str, part: Part, body: int) -> list
     named = {model.geom(g).name: g for g in geoms}
     for suffix in part.geoms:
         if f"{name}_{suffix}" not in named:
-            raise SceneError(f"{name} has no collision geom {suffix!r}, which its recipe asks for")
+            raise SceneError(f"{name} has no collision geom {suffix!r}, which its recipe names")
     return [named[f"{name}_{suffix}"] for suffix in part.geoms] or geoms
 
 
@@ -316,7 +317,7 @@ class _Rebuild:
         return body == root
 
     def _clear(self) -> None:
-        """Take the hidden collision geoms away; geoms that are seen as well stay, without colliding."""
+        """Remove the hidden collision geoms; visible geoms stay, but no longer collide."""
         for geom in list(self.spec.geoms):
             if not (geom.contype or geom.conaffinity):
                 continue
@@ -351,12 +352,12 @@ class _Rebuild:
         geom.friction, geom.solmix = model.geom_friction[like], float(model.geom_solmix[like])
         geom.solref, geom.solimp = model.geom_solref[like], model.geom_solimp[like]
         margin = float(model.geom_margin[like])
-        geom.margin = 0.0 if margin == contacts.MESH_MARGIN else margin  # what stands for a mesh is none
+        geom.margin = 0.0 if margin == contacts.MESH_MARGIN else margin  # no mesh replaces a mesh
         geom.gap = float(model.geom_gap[like])
         return geom
 
     def _keep_masses(self) -> None:
-        """State every body's inertia as it was computed from the exact geoms, and the scene's extent likewise."""
+        """Set every body's inertia, and the scene's extent, to the values computed from the exact geoms."""
         for index, body in enumerate(self.spec.bodies):
             if index:
                 body.explicitinertial = True
@@ -414,7 +415,7 @@ def solid_of(model: mujoco.MjModel, geom: int) -> Solid:
         return Solid(shapes.CYLINDER, pos, mat, size)
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         return _hull(model, geom, pos, mat)
-    raise SceneError(f"geom {model.geom(geom).name!r} is a {kind.name}, which no fit knows")
+    raise SceneError(f"geom {model.geom(geom).name!r} is a {kind.name}, which no fit supports")
 
 
 def _hull(model: mujoco.MjModel, geom: int, pos: np.ndarray, mat: np.ndarray) -> Solid:

@@ -1,4 +1,4 @@
-"""Which simple shapes stand for which LIBERO object, in several levels of detail: the data behind lean geometry.
+"""Which simple shapes replace which LIBERO object, in several levels of detail: the data behind lean geometry.
 
 In: a category. Out: its recipe, whose kinds are in ``vecenv.libero.scene.lean.detail``. The fits are in
 ``vecenv.libero.scene.lean.fits``, how much detail a thing gets is up to ``vecenv.libero.scene.lean.geometry``.

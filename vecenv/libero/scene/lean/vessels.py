@@ -128,7 +128,7 @@ def vessel(solids: Sequence[Solid], walls: int, handles: int = 0) -> list[Solid]
     rim does not lie on the ground.
 
     Raises:
-        FitError: the solids have no ring of walls, or no handle where one is asked for.
+        FitError: the solids have no ring of walls, or no handle where one is required.
     """
     found = find_vessel(solids)
     ring = _ring(found, walls) if walls else []

@@ -1,0 +1,251 @@
+"""Several suites and several seeds as one evaluation, averaged as papers print it.
+
+An ``EvalConfig`` that names more than one suite or seed comes in. Each pair of suite and seed is a run of its own, with
+a results folder of its own inside the campaign's (``DIR/libero_goal``, ``DIR/libero_goal/seed-1``), so everything that
+reads a results folder reads each of them. Out: :class:`CampaignSummary`, also ``summary.json`` and ``report.md``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.results import EvalResult, Progress, begin, resume
+from vecenv_eval.runner import Evaluation
+from vecenv_eval.simulator import Simulator
+from vecenv_eval.store import CONFIG, REPORT, SUMMARY, StoreError
+
+CAMPAIGN = "campaign.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leg:
+    """One run of a campaign.
+
+    Attributes:
+        suite: its suite.
+        seed: its seed, None for the protocol's.
+        config: what is evaluated.
+        folder: its results folder.
+    """
+
+    suite: str
+    seed: int | None
+    config: EvalConfig
+    folder: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteRow:
+    """A suite's success over its seeds, as shares of its episodes.
+
+    Attributes:
+        suite: the suite.
+        rates: of each seed, None where no episode has a verdict.
+        mean: of the rates, None without any.
+        std: their sample standard deviation, None with fewer than two.
+        episodes: episodes with a verdict, all seeds together.
+        errors, missing: episodes without one.
+    """
+
+    suite: str
+    rates: tuple[float | None, ...]
+    mean: float | None
+    std: float | None
+    episodes: int
+    errors: int
+    missing: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignSummary:
+    """A campaign in numbers.
+
+    Attributes:
+        policy: what was evaluated.
+        seeds: the seeds, None for the protocol's.
+        suites: one row a suite.
+        average: mean over suites of the mean over seeds, each suite counting once; None while one has no verdict.
+        average_std: sample standard deviation over seeds of that average, None with fewer than two seeds.
+    """
+
+    policy: str
+    seeds: tuple[int | None, ...]
+    suites: tuple[SuiteRow, ...]
+    average: float | None
+    average_std: float | None
+
+
+def is_campaign(config: EvalConfig) -> bool:
+    """Whether a config asks for more than one run."""
+    return len(config.suites) > 1 or config.seeds is not None
+
+
+def legs(config: EvalConfig, folder: Path) -> list[Leg]:
+    """The runs of a campaign, suite by suite.
+
+    Raises:
+        ConfigError: no suite, or seeds that are none.
+    """
+    if not config.suites:
+        raise ConfigError("no suite is named")
+    made = []
+    for suite in config.suites:
+        for seed in config.all_seeds:
+            own = replace(config, suite=suite, seed=seed, seeds=None, policy=config.policy)
+            place = folder / suite.replace("/", "-")
+            made.append(
+                Leg(suite=suite, seed=seed, config=own, folder=place / f"seed-{seed}" if config.seeds else place)
+            )
+    return made
+
+
+class Campaign:
+    """The runs of a config that names several suites or seeds; making one checks every run's settings.
+
+    Args:
+        config: what to evaluate.
+        folder: the results folder of the whole.
+        simulator: where environments come from, ``vecenv`` when not given.
+
+    Raises:
+        ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
+    """
+
+    def __init__(self, config: EvalConfig, folder: Path, simulator: Simulator | None = None) -> None:
+        self.config, self.folder, self._simulator = config, folder, simulator
+        self.legs = legs(config, folder)
+        for leg in self.legs:
+            Evaluation(leg.config, simulator)
+
+    @classmethod
+    def open(cls, folder: Path, simulator: Simulator | None = None) -> Campaign:
+        """A campaign that is continued.
+
+        Raises:
+            StoreError: the folder holds none.
+        """
+        try:
+            config = EvalConfig.from_dict(json.loads((folder / CAMPAIGN).read_text()))
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{folder / CAMPAIGN} cannot be read: {error}") from None
+        return cls(config, folder, simulator)
+
+    def run(
+        self,
+        on_progress: Callable[[Leg, Progress], None] = lambda leg, progress: None,
+        on_result: Callable[[Leg, EvalResult], None] = lambda leg, result: None,
+    ) -> tuple[CampaignSummary, list[EvalResult]]:
+        """Run what has no verdict yet, run by run; Ctrl-C ends it with what was computed.
+
+        Raises:
+            StoreError: something is in the way.
+        """
+        if not (self.folder / CAMPAIGN).exists():
+            if self.folder.exists() and any(self.folder.iterdir()):
+                raise StoreError(f"{self.folder} is already there and not empty: name another, or use --resume")
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / CAMPAIGN).write_text(json.dumps(self.config.to_dict(), indent=2) + "\n")
+        results: list[EvalResult] = []
+        for leg in self.legs:
+            begun = (leg.folder / CONFIG).exists()
+            config, store = resume(leg.folder) if begun else (leg.config, begin(leg.config, leg.folder))
+
+            def report(progress: Progress, leg: Leg = leg) -> None:
+                on_progress(leg, progress)
+
+            result = Evaluation(config, self._simulator).run(store, report)
+            results.append(result)
+            on_result(leg, result)
+            self._write(results)
+            if result.interrupted:
+                break
+        return self._write(results), results
+
+    def _write(self, results: Sequence[EvalResult]) -> CampaignSummary:
+        summary = summarise(self.legs[: len(results)], results)
+        (self.folder / SUMMARY).write_text(json.dumps(asdict(summary), indent=2) + "\n")
+        (self.folder / REPORT).write_text(markdown(summary))
+        return summary
+
+
+def summarise(run: Sequence[Leg], results: Sequence[EvalResult]) -> CampaignSummary:
+    """The numbers of the runs that there are."""
+    by_suite: dict[str, list[EvalResult]] = {}
+    for leg, result in zip(run, results, strict=True):
+        by_suite.setdefault(leg.suite, []).append(result)
+    rows = tuple(_row(suite, some) for suite, some in by_suite.items())
+    means = [row.mean for row in rows]
+    seeds = tuple(dict.fromkeys(leg.seed for leg in run))
+    per_seed = [_mean([row.rates[index] for row in rows if index < len(row.rates)]) for index in range(len(seeds))]
+    return CampaignSummary(
+        policy=results[0].summary.policy if results else "",
+        seeds=seeds,
+        suites=rows,
+        average=_mean(means),
+        average_std=_std(per_seed),
+    )
+
+
+def _row(suite: str, results: Sequence[EvalResult]) -> SuiteRow:
+    totals = [result.summary.total for result in results]
+    rates = tuple(total.rate for total in totals)
+    return SuiteRow(
+        suite=suite,
+        rates=rates,
+        mean=_mean(rates),
+        std=_std(rates),
+        episodes=sum(total.episodes for total in totals),
+        errors=sum(total.errors for total in totals),
+        missing=sum(total.missing for total in totals),
+    )
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return math.fsum(there) / len(there) if there and len(there) == len(values) else None
+
+
+def _std(values: Sequence[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return statistics.stdev(there) if len(there) > 1 else None
+
+
+def markdown(summary: CampaignSummary) -> str:
+    """A table for ``report.md``: a row a suite, and the average over suites."""
+    several = len(summary.seeds) > 1
+    head = [
+        "suite",
+        "success",
+        *([f"seed {seed}" for seed in summary.seeds] if several else []),
+        "episodes",
+        "no verdict",
+    ]
+    lines = [f"# {summary.policy}", "", _line(head), _line(["---"] * len(head))]
+    for row in summary.suites:
+        each = [_percent(rate) for rate in row.rates] if several else []
+        each += ["-"] * (len(summary.seeds) - len(row.rates) if several else 0)
+        lines.append(_line([row.suite, _spread(row.mean, row.std), *each, row.episodes, row.errors + row.missing]))
+    blanks = [""] * (len(head) - 2)
+    lines.append(_line(["average over suites", _spread(summary.average, summary.average_std), *blanks]))
+    if several:
+        lines += ["", "Success: mean and sample standard deviation over seeds."]
+    return "\n".join(lines) + "\n"
+
+
+def _line(cells: Sequence[Any]) -> str:
+    return "| " + " | ".join(str(cell) for cell in cells) + " |"
+
+
+def _percent(rate: float | None) -> str:
+    return "-" if rate is None else f"{100 * rate:.1f}%"
+
+
+def _spread(mean: float | None, std: float | None) -> str:
+    return _percent(mean) if std is None else f"{_percent(mean)} ± {100 * std:.1f}"

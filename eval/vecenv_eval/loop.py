@@ -1,0 +1,342 @@
+"""One run over the episodes of an evaluation: every verdict is written when its episode ends.
+
+Episodes come as streams (``vecenv_eval.episodes.Stream``): those that the slots of an environment begin with, and those
+that follow as slots end. A policy that can begin single slots (``vecenv_eval.policies.Refillable``) gets the next
+episode of a scene in a slot as soon as the one before has ended; any other policy gets batches, one after the other.
+
+An exception costs the episodes that were running: they are written as errors with the cause, and the others still run.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections import deque
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import TypeAlias
+
+import numpy as np
+
+from vecenv.contract import BatchEnv, Control, Metrics
+from vecenv_eval.clocks import EpisodeClocks
+from vecenv_eval.conditions import conditions
+from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.drive import drive
+from vecenv_eval.environments import Environments, Placed, make_arguments, slots_of
+from vecenv_eval.episodes import Episode, Stream, Suite
+from vecenv_eval.policies import Ending, Policy, Refillable, extras_of
+from vecenv_eval.results import Progress, count
+from vecenv_eval.simulator import Simulator
+from vecenv_eval.store import Record, ResultStore
+
+# Called with which slots have just finished, bool [B], with the verdicts, bool [B], and with the faults, B strings.
+_Finish: TypeAlias = Callable[[np.ndarray, np.ndarray, Sequence[str]], None]
+# Called with the slots that begin other episodes, and with the episodes.
+_Begin: TypeAlias = Callable[[Sequence[int], Sequence[int]], None]
+# On a GPU a reset of a few slots costs as much as of all: slots wait until this share of them can begin together.
+_SHARE_TO_REFILL = {"native": 0.0, "physx_cpu": 0.0}
+_GPU_SHARE = 1 / 16
+
+
+class EpisodeLoop:
+    """Runs streams one after the other.
+
+    Args:
+        config: what is evaluated, and how.
+        suite: the suite.
+        policy: acts for every environment.
+        simulator: builds environments.
+        store: the results folder.
+        planned: every episode of the evaluation, those done before included.
+        on_progress: called after every call of the policy.
+        index: number of this run on the folder, from 0.
+
+    Attributes:
+        causes: what failed, one line each, without repetition.
+    """
+
+    def __init__(
+        self,
+        config: EvalConfig,
+        suite: Suite,
+        policy: Policy,
+        simulator: Simulator,
+        store: ResultStore,
+        *,
+        planned: Collection[Episode],
+        on_progress: Callable[[Progress], None],
+        index: int,
+    ) -> None:
+        self.causes: dict[str, None] = {}
+        self._config, self._suite, self._policy, self._simulator = config, suite, policy, simulator
+        self._store, self._index = store, index
+        wanted = frozenset(planned)
+        self._records = {key: r for key, r in store.records().items() if key in wanted and not r.error}
+        self._progress = _ProgressReports(on_progress, len(wanted), self._records)
+        self._environments = Environments(simulator, suite, config, self._write_conditions)
+        self._number = self._failures = self._verdicts = 0
+        self._refill_share = _SHARE_TO_REFILL.get(config.backend, _GPU_SHARE)
+
+    def run(self, streams: Sequence[Stream], plan: Callable[[Collection[Episode]], Sequence[Stream]]) -> bool:
+        """Run every stream; True when stopped from the keyboard.
+
+        Episodes that end in an error run again, as often as the config says. When two streams have failed and no
+        episode of this run has a verdict, the rest is not tried.
+
+        Args:
+            streams: what to run.
+            plan: makes streams of the episodes that are to run again.
+
+        Raises:
+            ConfigError: the environment refuses a setting.
+        """
+        try:
+            queue = deque(streams)
+            for _ in range(1 + self._config.retries):
+                if not self._run_all(queue):
+                    break
+                queue = deque(plan(self._failed))
+        except KeyboardInterrupt:
+            return True
+        finally:
+            self._environments.close()
+        return False
+
+    def _run_all(self, queue: deque[Stream]) -> bool:
+        """Run streams until none is left; False when to stop for good."""
+        while queue:
+            self._progress.num_batches = self._number + len(queue)
+            rest = self._run_safely(self._number, queue.popleft())
+            self._number += 1
+            if rest is not None:
+                self._failures += 1
+                if self._config.fail_fast or (self._failures > 1 and not self._verdicts):
+                    return False
+                queue.extendleft([rest] if len(rest) else [])
+        return True
+
+    @property
+    def _failed(self) -> frozenset[Episode]:
+        """Episodes that ended in an error."""
+        return frozenset(key for key, record in self._records.items() if record.error)
+
+    def _run_safely(self, number: int, stream: Stream) -> Stream | None:
+        """Run one stream; an exception is recorded for the episodes it cost, and what had not begun is returned."""
+        try:
+            self._progress.report(number, setting_up=True)
+            placed = self._environments.place(stream)
+        except ConfigError:
+            raise
+        except Exception as error:  # a simulator that cannot place these episodes may place others
+            self._write_errors(number, stream.episodes, error)
+            self._environments.close()
+            return Stream(stream.suite, ())
+        running = _Running(self._suite, placed, stream)
+        try:
+            with self._recording(running) as (begin, finish):
+                self._run_placed(number, running, begin, finish)
+        except Exception as error:  # whatever a policy or a simulator raises concerns the running episodes only
+            self._write_errors(number, running.slots, error)
+            self._environments.close()
+            return running.rest(len(placed.slots))
+        return None
+
+    def _run_placed(self, number: int, running: _Running, begin: _Begin, finish: _Finish) -> None:
+        """Let the policy act until every slot has finished and nothing waits."""
+        env, progress = running.placed.env, self._progress
+        clocks = EpisodeClocks(env, running.placed.setup_s)
+        before = progress.steps, progress.seconds
+        ended = 0
+
+        def refill(done: np.ndarray) -> np.ndarray:
+            nonlocal ended
+            rows = running.slots_to_refill(done, self._refill_share)
+            if len(rows):
+                ended += int(env.evaluate().num_steps[rows].sum())
+                began = clocks.now()
+                running.refill(rows)
+                assert isinstance(self._policy, Refillable)
+                self._policy.reset_slots(env, running.info, rows)
+                begin(rows.tolist(), [running.slots[row].episode for row in rows.tolist()])
+                clocks.begin(rows, clocks.now() - began)
+            return rows
+
+        self._policy.reset(env, running.info)
+        refillable = isinstance(self._policy, Refillable)
+        for control, finished in drive(env, self._policy, refill if refillable else None):
+            clocks.tick(control)
+            if finished.any():
+                metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
+                finish(finished, metrics.success, control.info["fault"])
+                self._write([self._record(number, running, i, metrics, control, clocks) for i in slots])
+                self._verdicts += len(slots)
+                self._tell_policy(running, slots)
+            progress.steps, progress.seconds = (
+                before[0] + ended + int(control.step_index.sum()),
+                before[1] + clocks.now(),
+            )
+            progress.report(number)
+
+    def _tell_policy(self, running: _Running, slots: Sequence[int]) -> None:
+        if isinstance(self._policy, Ending):
+            for slot in slots:
+                self._policy.episode_end(slot, asdict(self._records[running.slots[slot]]))
+
+    @contextmanager
+    def _recording(self, running: _Running) -> Iterator[tuple[_Begin, _Finish]]:
+        """Record the episodes when asked to; gives what to call with slots that begin, and with slots that finish."""
+        if not self._config.records:
+            yield lambda slots, episodes: None, lambda finished, success, faults: None
+            return
+        from vecenv_eval.demos.options import make_options
+        from vecenv_eval.demos.record import Recorder
+        from vecenv_eval.demos.write import write_demos
+
+        options = make_options(self._simulator.make, suite=self._suite.name, **make_arguments(self._config))
+        episodes = [slot.episode for slot in running.slots]
+        recorder = Recorder(running.placed.env, episodes, options, states=self._config.record_states)
+
+        def finish(finished: np.ndarray, success: np.ndarray, faults: Sequence[str]) -> None:
+            # A recording is on the disk before its verdict is: what has a verdict is not run again.
+            recorder.finish(finished, success, faults)
+            taken = recorder.take()
+            by_task: dict[tuple[str, int], list[int]] = {}
+            for slot in taken:
+                by_task.setdefault((running.slots[slot].suite, running.slots[slot].task), []).append(slot)
+            for key, slots in by_task.items():
+                chosen = [taken[slot] for slot in slots]
+                write_demos(self._store.demos_path(*key), *key, self._suite.instructions[key[1]], chosen)
+
+        with recorder.listening():
+            yield recorder.begin, finish
+
+    def _record(
+        self, number: int, running: _Running, slot: int, metrics: Metrics, control: Control, clocks: EpisodeClocks
+    ) -> Record:
+        """The record of a slot that has just finished."""
+        episode = running.slots[slot]
+        return Record(
+            suite=episode.suite,
+            task=episode.task,
+            episode=episode.episode,
+            instruction=running.info.instruction[slot],
+            success=bool(metrics.success[slot]),
+            success_first=bool(metrics.success_first[slot]),
+            success_final=bool(metrics.success_final[slot]),
+            num_steps=int(metrics.num_steps[slot]),
+            reward=float(metrics.cumulative_reward[slot]),
+            fault=control.info["fault"][slot],
+            sanitized=int(clocks.sanitized[slot]),
+            sanitized_first=None if clocks.sanitized[slot] == 0 else int(clocks.sanitized_first[slot]),
+            run=self._index,
+            batch=number,
+            **clocks.seconds_of(slot),
+            extras=extras_of(self._policy, slot),
+            stand_ins=tuple(control.info["stand_ins"][slot]) if "stand_ins" in control.info else (),
+        )
+
+    def _write_errors(self, number: int, episodes: Sequence[Episode], error: Exception) -> None:
+        cause = f"{type(error).__name__}: {error}".splitlines()[0]
+        self.causes[cause] = None
+        self._store.log_error(f"run {self._index} batch {number} ({len(episodes)} episodes)\n{traceback.format_exc()}")
+        failed = [
+            Record(
+                suite=episode.suite,
+                task=episode.task,
+                episode=episode.episode,
+                instruction=self._suite.instructions[episode.task],
+                success=False,
+                num_steps=0,
+                reward=0.0,
+                error=cause,
+                run=self._index,
+                batch=number,
+            )
+            for episode in episodes
+            if episode not in self._records or self._records[episode].error
+        ]
+        self._write(failed)
+        self._progress.report(number)
+
+    def _write(self, records: Sequence[Record]) -> None:
+        self._store.append(records)
+        self._records.update({record.key: record for record in records})
+        self._progress.count(self._records)
+
+    def _write_conditions(self, env: BatchEnv) -> None:
+        self._store.write_config({**self._store.config(), "conditions": conditions(env, self._config)})
+
+
+class _Running:
+    """A stream in its environment: which episode is in each slot now, and which still wait.
+
+    Attributes:
+        placed: the environment and its first episodes.
+        slots: the episode in each slot.
+        info: what the last reset returned.
+    """
+
+    def __init__(self, suite: Suite, placed: Placed, stream: Stream) -> None:
+        self.placed, self.slots, self.info = placed, list(placed.slots), placed.info
+        self._suite = suite
+        self._waiting: dict[Hashable, deque[Episode]] = {scene: deque(e) for scene, e in stream.waiting.items()}
+
+    def slots_to_refill(self, done: np.ndarray, share: float) -> np.ndarray:
+        """Finished slots for whose scene an episode waits; none before they are a share of all, unless all are done."""
+        rows = []
+        left = {scene: len(episodes) for scene, episodes in self._waiting.items()}
+        for row in np.flatnonzero(done).tolist():
+            scene = self._suite.scenes[self.slots[row].task]
+            if left.get(scene, 0):
+                left[scene] -= 1
+                rows.append(row)
+        enough = len(rows) >= share * len(done) or done.all()
+        return np.array(rows if enough else [], int)
+
+    def refill(self, rows: np.ndarray) -> None:
+        """Place the next episode of their scene in finished slots, and reset them."""
+        for row in rows.tolist():
+            self.slots[row] = self._waiting[self._suite.scenes[self.slots[row].task]].popleft()
+        chosen = [self.slots[row] for row in rows.tolist()]
+        env = self.placed.env
+        env.set_episodes(tasks=[e.task for e in chosen], episodes=[e.episode for e in chosen], slots=rows)
+        self.info = env.reset()
+        slots_of(self.info, self.slots)
+
+    def rest(self, num_slots: int) -> Stream:
+        """The episodes that have not begun, for as many slots."""
+        waiting = {scene: tuple(episodes) for scene, episodes in self._waiting.items() if episodes}
+        first, rest = [], {}
+        for scene, episodes in waiting.items():
+            count = max(1, num_slots // len(waiting))
+            first += episodes[:count]
+            rest[scene] = episodes[count:]
+        return Stream(self._suite.name, tuple(first), rest)
+
+
+class _ProgressReports:
+    """The numbers of :class:`Progress` while they change, and whom to tell."""
+
+    def __init__(self, on_progress: Callable[[Progress], None], total: int, records: dict[Episode, Record]) -> None:
+        self.steps, self.seconds, self.num_batches = 0, 0.0, 0
+        self._on_progress, self._total = on_progress, total
+        self.count(records)
+
+    def count(self, records: dict[Episode, Record]) -> None:
+        """Count the records there are now."""
+        self._counts = count(records.values())
+
+    def report(self, batch: int, setting_up: bool = False) -> None:
+        """Call ``on_progress``."""
+        self._on_progress(
+            Progress(
+                total=self._total,
+                **self._counts,
+                steps=self.steps,
+                seconds=self.seconds,
+                batch=batch,
+                num_batches=self.num_batches,
+                setting_up=setting_up,
+            )
+        )

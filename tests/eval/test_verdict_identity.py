@@ -1,0 +1,108 @@
+"""A verdict belongs to (task, init state, seed, what the policy replied), and not to the batch around it.
+
+Rows of the results folder, without what says when and how fast they came about, are the same byte for byte at any
+number of slots and threads, in any order of refills, for any split into runs. Each row holds a hash of every state the
+episode went through, so that two trajectories with the same verdict are told apart.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from vecenv_eval import policies
+from vecenv_eval.config import EvalConfig
+from vecenv_eval.policies.pick_place.policy import PickPlacePolicy
+from vecenv_eval.policies.random import RandomPolicy
+from vecenv_eval.results import begin, resume
+from vecenv_eval.runner import evaluate
+from vecenv_eval.store import EPISODES, ResultStore
+
+from vecenv.contract import BatchEnv, ResetInfo
+
+POLICIES = {"random": RandomPolicy, "pick_place": PickPlacePolicy}
+
+
+class Hashing:
+    """Another policy, with a hash of the states that each episode went through in its record."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self._policy = name, POLICIES[name]()
+        self._hashes: list[Any] = []
+
+    def reset(self, env: BatchEnv, info: ResetInfo) -> None:
+        self._hashes = [hashlib.sha256() for _ in range(env.num_envs)]
+        self._policy.reset(env, info)
+
+    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
+        for slot in slots.tolist():
+            self._hashes[slot] = hashlib.sha256()
+        self._policy.reset_slots(env, info, slots)
+
+    def act(self, env: BatchEnv) -> np.ndarray:
+        state = env.state()
+        for slot in np.flatnonzero(~env.done).tolist():
+            self._hashes[slot].update(state.qpos[slot, : state.nq[slot]].tobytes())
+            self._hashes[slot].update(state.qvel[slot, : state.nv[slot]].tobytes())
+        return self._policy.act(env)
+
+    def extras(self, slot: int) -> dict[str, str]:
+        return {"states": self._hashes[slot].hexdigest()}
+
+
+@pytest.fixture
+def hashed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Built-in policies report what they went through."""
+    monkeypatch.setattr(policies, "_load", lambda name: lambda: Hashing(name))
+
+
+def rows(folder: Path) -> list[str]:
+    """Lines of the store without their circumstances, ordered by episode."""
+    records = sorted(ResultStore.open(folder).records().values(), key=lambda record: record.key)
+    return [json.dumps(record.verdict, sort_keys=True) for record in records]
+
+
+def run(folder: Path, policy: str, **settings: Any) -> list[str]:
+    config = EvalConfig(**{"suite": "libero_goal", "policy": policy, "tasks": "1,3,7", "episodes": "3", **settings})
+    assert evaluate(config, begin(config, folder)).ok
+    return rows(folder)
+
+
+@pytest.mark.usefixtures("hashed")
+@pytest.mark.parametrize(("policy", "max_steps"), [("random", 12), ("pick_place", 60)])
+def test_rows_do_not_depend_on_slots_threads_or_refills(tmp_path: Path, policy: str, max_steps: int) -> None:
+    whole = run(tmp_path / "whole", policy, max_steps=max_steps)
+    assert len(set(whole)) == 9
+    for number, (num_envs, threads) in enumerate([(1, 1), (2, 2), (4, 1), (7, 3)]):
+        split = run(tmp_path / str(number), policy, max_steps=max_steps, num_envs=num_envs, num_threads=threads)
+        assert split == whole, f"{num_envs} slots on {threads} threads"
+
+
+@pytest.mark.usefixtures("hashed")
+def test_rows_do_not_depend_on_where_a_run_was_interrupted(tmp_path: Path) -> None:
+    whole = run(tmp_path / "whole", "random", max_steps=12)
+    folder = tmp_path / "resumed"
+    run(folder, "random", max_steps=12, num_envs=3)
+    lines = (folder / EPISODES).read_text().splitlines(keepends=True)
+    (folder / EPISODES).write_text("".join(lines[:4]) + lines[4][:20])  # as a crash leaves it
+    config, store = resume(folder, num_envs=2)
+    assert evaluate(config, store).ok
+    assert rows(folder) == whole
+
+
+@pytest.mark.usefixtures("hashed")
+@pytest.mark.parametrize("protocol", ["openvla", "lerobot"])
+def test_rows_of_published_protocols_do_not_depend_on_the_batch(tmp_path: Path, protocol: str) -> None:
+    """Raw starts, idle ticks, and fixtures where upstream's resets put them."""
+    settings = {"protocol": protocol, "max_steps": 6, "episodes": "0,4", "tasks": "0-2"}
+    assert run(tmp_path / "one", "random", num_envs=1, **settings) == run(tmp_path / "all", "random", **settings)
+
+
+@pytest.mark.usefixtures("hashed")
+def test_rows_do_not_depend_on_how_scenes_share_the_slots(tmp_path: Path) -> None:
+    settings = {"suite": "libero_object", "tasks": "0-2", "episodes": "3", "max_steps": 10}
+    assert run(tmp_path / "few", "random", num_envs=4, **settings) == run(tmp_path / "all", "random", **settings)
