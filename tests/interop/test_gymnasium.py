@@ -427,7 +427,9 @@ def test_gymnasiums_checker_has_nothing_to_say_about_images() -> None:
 
 def test_gymnasiums_wrappers_record_videos_and_statistics_and_limit_time(tmp_path: Path) -> None:
     pytest.importorskip("moviepy")
-    env = RecordVideo(Env(SUITE, obs="state", render_mode="rgb_array", **SMALL), str(tmp_path), disable_logger=True)
+    env = RecordVideo(
+        Env(SUITE, obs="state", render_mode="rgb_array", **SMALL), str(tmp_path / "videos"), disable_logger=True
+    )
     env = RecordEpisodeStatistics(TimeLimit(env, 3))
     env.reset(seed=0)
     for action in actions(3, count=1)[:, 0]:
@@ -435,7 +437,7 @@ def test_gymnasiums_wrappers_record_videos_and_statistics_and_limit_time(tmp_pat
     assert truncated
     assert (info["episode"]["l"], info["episode"]["r"]) == (3, 0.0)
     env.close()
-    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
+    assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
 
 
 def test_the_budget_of_an_episode_can_be_given_by_gymnasiums_name() -> None:
