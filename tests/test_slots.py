@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import copy
+import os
+import pickle
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +13,7 @@ import pytest
 
 from vecenv import placement as placing
 from vecenv.contract import Control
+from vecenv.observations import Rendered
 from vecenv.slots import SlotBatch
 
 BUDGET = 3
@@ -161,3 +165,72 @@ def test_what_a_caller_gets_does_not_change_with_the_batch(env: Scripted) -> Non
     assert control.step_index.tolist() == metrics.num_steps.tolist() == [1, 1, 1]
     assert not control.terminated.any()
     assert not metrics.success.any()
+
+
+def test_episodes_that_are_ended_ignore_steps_until_reset() -> None:
+    env = Scripted(3)
+    env.reset()
+    env.tick(success=(2,))
+    env.end_episodes([1, 2])
+    control = env.tick()
+    assert control.step_index.tolist() == [2, 1, 1]
+    assert (control.truncated.tolist(), control.terminated.tolist()) == ([False, True, False], [False, False, True])
+    env.reset()
+    assert env.armed[-1] == [1, 2]
+
+
+# -- the object --------------------------------------------------------------------------------------------------------
+
+
+def test_an_environment_is_closed_at_the_end_of_a_with_block() -> None:
+    with Scripted(2) as env:
+        env.reset()
+    with pytest.raises(Refused, match="closed"):
+        env.reset()
+
+
+def test_an_environment_says_what_it_is_and_how_far() -> None:
+    env = Scripted(2)
+    assert repr(env) == "<Scripted suite, tasks a, b: 2 slots; waiting for reset()>"
+    env.reset()
+    env.tick(success=(1,))
+    assert repr(env) == "<Scripted suite, tasks a, b: 2 slots; 1 running, 1 successful>"
+    env.close()
+    assert repr(env) == "<Scripted suite, tasks a, b: 2 slots; closed>"
+
+
+def test_pickling_and_copying_say_what_to_do_instead() -> None:
+    for attempt in (pickle.dumps, copy.deepcopy):
+        with pytest.raises(Refused, match=r"cannot be pickled.*functools.partial\(vecenv.make.*state\(\)"):
+            attempt(Scripted(1))
+
+
+def test_another_process_is_refused_with_what_to_do_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = Scripted(1)
+    env.reset()
+    parent = os.getpid()
+    monkeypatch.setattr(os, "getpid", lambda: parent + 1)
+    for call in (env.reset, env.tick, env.evaluate):
+        with pytest.raises(Refused, match=f"made in process {parent} and this is process {parent + 1}.*'spawn'"):
+            call()
+
+
+# -- images ------------------------------------------------------------------------------------------------------------
+
+
+def test_images_answer_to_liberos_names_and_list_the_cameras_otherwise() -> None:
+    drawn: list[str] = []
+
+    def draw(names: Sequence[str]) -> dict[str, str]:
+        drawn.extend(names)
+        return {name: f"image of {name}" for name in names}
+
+    images = Rendered(["agentview", "wrist"], draw)
+    assert images["agentview_image"] == images["agentview"] == "image of agentview"
+    assert images["robot0_eye_in_hand_image"] == "image of wrist"
+    assert drawn == ["agentview", "wrist"]
+    assert list(images) == ["agentview", "wrist"]
+    assert "front" not in images
+    assert images.get("front") is None
+    with pytest.raises(KeyError, match="no camera 'front'; cameras: agentview, wrist"):
+        images["front"]

@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, Self, TypeAlias, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -279,4 +279,12 @@ class BatchEnv(Protocol):
 
     def close(self) -> None:
         """Release the simulator, once, at the end."""
+        ...
+
+    def __enter__(self) -> Self:
+        """``with vecenv.make(...) as env``: the environment is closed at the end of the block."""
+        ...
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
         ...

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
@@ -17,6 +18,10 @@ from vecenv.errors import NotFound
 
 class ImagesUnavailable(NotFound):
     """An observation does not have the requested image; the message names it and those that exist."""
+
+
+class UnknownCamera(ImagesUnavailable, KeyError):
+    """A camera that does not exist; the message lists those that do."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +42,22 @@ class CameraView:
 
 
 _Shown = TypeVar("_Shown")
+# Upstream's names of the two policy cameras and of their images.
+_CAMERA_ALIASES: Mapping[str, str] = MappingProxyType(
+    {
+        "agentview_image": "agentview",
+        "wrist_image": "wrist",
+        "robot0_eye_in_hand": "wrist",
+        "robot0_eye_in_hand_image": "wrist",
+    }
+)
 
 
 class Rendered(Mapping[str, _Shown]):
     """Images (or anything else) by camera, each made when it is first read and kept.
+
+    LIBERO's names work as well: ``images["agentview_image"]`` is ``images["agentview"]``, and
+    ``images["robot0_eye_in_hand_image"]`` is ``images["wrist"]``. Another name raises ``UnknownCamera``.
 
     Args:
         names: the cameras.
@@ -53,18 +70,25 @@ class Rendered(Mapping[str, _Shown]):
 
     def prepare(self, *names: str) -> None:
         """Make several in one call, which takes less time than one call each."""
-        missing = [name for name in names if name in self._names and name not in self._made]
+        known = [self._canonical(name) for name in names if name in self]
+        missing = [name for name in known if name not in self._made]
         if missing:
             self._made.update(self._render(missing))
 
     def __getitem__(self, name: str) -> _Shown:
-        if name not in self._names:
-            raise KeyError(name)
+        if name not in self:
+            raise UnknownCamera(f"there is no camera {name!r}; cameras: {', '.join(self._names) or 'none'}")
         self.prepare(name)
-        return self._made[name]
+        return self._made[self._canonical(name)]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._names
+        return isinstance(name, str) and self._canonical(name) in self._names
+
+    def _canonical(self, name: str) -> str:
+        return name if name in self._names else _CAMERA_ALIASES.get(name, name)
+
+    def __repr__(self) -> str:
+        return f"Rendered(cameras: {', '.join(self._names) or 'none'})"
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

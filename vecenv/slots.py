@@ -6,11 +6,12 @@ and the rules about finished and quarantined slots.
 
 from __future__ import annotations
 
+import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NoReturn, Self, SupportsIndex, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,8 @@ from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.placement import Placement, PlacementError
 
 _Kind = TypeVar("_Kind", bound=Control)
+# Tasks that ``repr`` names before it only counts them.
+_LISTED = 8
 
 
 class SlotBatch(ABC):
@@ -39,6 +42,7 @@ class SlotBatch(ABC):
         self.suite, self.num_envs = suite, num_envs
         self._until_success = success == FIRST
         self._closed = False
+        self._process = os.getpid()
         self._watchers: list[Watcher] = []
         self._physics_s = 0.0
 
@@ -217,6 +221,19 @@ class SlotBatch(ABC):
         self._live |= stale
         self._quarantine(stale)
 
+    def end_episodes(self, slots: Any) -> None:
+        """End the episodes of some slots: truncated, they ignore further steps and cost nothing until ``reset``.
+
+        Args:
+            slots: bool [B] or indices.
+
+        Raises:
+            PlacementError: a mask of another length, or a slot that does not exist.
+        """
+        self._check_live()
+        rows = self.slot_indices(slots)
+        self._truncated[rows] |= ~self._terminated[rows]
+
     def instructions(self) -> tuple[str, ...]:
         """The current instruction of each slot; SIMPLER tasks in two halves have two, one after the other."""
         return tuple(self._instruction(slot) for slot in range(self.num_envs))
@@ -394,9 +411,44 @@ class SlotBatch(ABC):
         """Slots that have finished their episode, bool [B]."""
         return self._terminated | self._truncated
 
+    def close(self) -> None:
+        """Release the simulator; closing twice is harmless."""
+        self._closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        about = [f"{self.num_envs} slot{'' if self.num_envs == 1 else 's'}"]
+        if self._closed:
+            about.append("closed")
+        elif self._live.all():
+            about.append(f"{int((~self.done).sum())} running, {int(self._success.sum())} successful")
+        else:
+            about.append("waiting for reset()")
+        labels = list(dict.fromkeys(self._label(int(task)) for task in self._placement.task))
+        tasks = ", ".join(labels if len(labels) <= _LISTED else [*labels[:_LISTED], f"... ({len(labels)} in all)"])
+        return f"<{type(self).__name__} {self.suite}, tasks {tasks}: {'; '.join(about)}>"
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
+        raise self._error(
+            f"{type(self).__name__} cannot be pickled or copied: it holds a running simulator. Send a function that "
+            "makes one, such as functools.partial(vecenv.make, suite, tasks=..., episodes=...), and call it in the "
+            "process that uses it; to save the physics use state() and set_state()"
+        )
+
     def _check_open(self) -> None:
         if self._closed:
             raise self._error("the environment is closed")
+        if os.getpid() != self._process:
+            raise self._error(
+                f"the environment was made in process {self._process} and this is process {os.getpid()}: its threads "
+                "and renderer do not survive a fork. Call vecenv.make in the process that uses it, or start processes "
+                "with multiprocessing.get_context('spawn')"
+            )
 
     def _check_live(self) -> None:
         self._check_open()
