@@ -1,8 +1,8 @@
 """Refilled slots against batches that wait for their slowest episode, on a policy whose episodes differ in length.
 
 Both sides run the same episodes with the same actions in turns: once through ``reset_slots``, once in batches. The
-policy holds still; how long an episode lasts is drawn from an exponential distribution by the episode's name and ended by
-the budget of that slot, as a policy that solves most tasks early and a few late would. Ratio first.
+policy holds still. The length of an episode is drawn from an exponential distribution by its name, as with a policy
+that solves most tasks early and a few late. Ratio first.
 
     python benchmarks/refill.py --slots 16 --episodes 160
 """
