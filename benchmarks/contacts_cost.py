@@ -21,13 +21,13 @@ from typing import Any
 import mujoco
 import numpy as np
 from common import report
-from eval.bench import random_actions
 from mujoco.batch import Batch
-from vecenv.libero.contacts import MESH_MARGIN, OPTIONS, mark
-from vecenv.machine import usable_cores
+from vecenv_eval.bench.physics import random_actions
 
 import vecenv
 from vecenv.libero.env import LiberoEnv
+from vecenv.libero.scene.contacts import MESH_MARGIN, OPTIONS, mark
+from vecenv.util.cores import usable_cores
 
 BATCH = 64
 OWN = ("published, own way", "current, own way")

@@ -45,7 +45,7 @@ from vecenv.libero.scene import goals
 from vecenv.libero.scene.arenas import ARENAS
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.scene import compile_scene
-from vecenv.libero.tasks.suites import NUM_EPISODES
+from vecenv.libero.tasks.suites import NUM_EPISODES, list_tasks
 
 IDLE_TICKS = 50
 MOVED = 0.005
@@ -181,7 +181,7 @@ def init_predicates(suite: str, task: int, seen: Mapping[str, np.ndarray], margi
 
     Things that are at most ``margin`` metres apart touch.
     """
-    problem, slots = vecenv.list_tasks(suite)[task].problem(), np.arange(len(seen["qpos"]))
+    problem, slots = list_tasks(suite)[task].problem(), np.arange(len(seen["qpos"]))
     objects = {instance.name for instance in problem.objects}
     wanted = tuple(p for p in problem.init if len(p.args) == 1 or p.args[0] in objects)
     premise = dataclasses.replace(problem, goal=wanted)
@@ -207,7 +207,7 @@ def summarise(exceptions: Mapping[str, Any], checked: Mapping[str, int]) -> list
     """A row a suite and backend: how many starts miss each premise."""
     rows = []
     for side, suite in sorted({tuple(key.split("/")[:2]) for key in checked}):
-        specs = vecenv.list_tasks(suite)
+        specs = list_tasks(suite)
         missed: dict[str, set[tuple[int, int]]] = defaultdict(set)
         counts = {key: number for key, number in checked.items() if key.startswith(f"{side}/{suite}/")}
         for key in counts:

@@ -24,6 +24,7 @@ from support.images import psnr, ssim
 
 import vecenv
 from vecenv.libero.render.options import RenderConfig
+from vecenv.libero.tasks.suites import list_tasks
 from vecenv.util.cores import usable_cores
 
 TASKS = [("libero_object", 0), ("libero_spatial", 0), ("libero_10", 0)]
@@ -37,7 +38,7 @@ def upstream_batch(suite: str, task: int, workers: int) -> Callable[[np.ndarray]
     upstream._classes()
     with upstream.silence():
         from libero.libero.envs import OffScreenRenderEnv, SubprocVectorEnv
-    spec = vecenv.list_tasks(suite)[task]
+    spec = list_tasks(suite)[task]
     make = functools.partial(
         OffScreenRenderEnv, bddl_file_name=str(spec.bddl_path), camera_heights=SIZE, camera_widths=SIZE
     )

@@ -211,13 +211,13 @@ def save_images(path: Path, left: np.ndarray, right: np.ndarray) -> None:
 
 def write(options: argparse.Namespace) -> None:
     """Sceneries and references of the scenes."""
-    import vecenv
     from vecenv.libero.render.scenery import scenery_of
     from vecenv.libero.scene.scene import compile_scene
+    from vecenv.libero.tasks.suites import list_tasks
 
     for scene in options.scene:
         suite, task = scene.rsplit("/", 1)
-        problem = vecenv.list_tasks(suite)[int(task)].problem()
+        problem = list_tasks(suite)[int(task)].problem()
         options.sceneries.mkdir(parents=True, exist_ok=True)
         scenery_of(compile_scene(problem, visual=True)).save(options.sceneries / f"{suite}_{task}.npz")
         for size in options.size if options.references else ():

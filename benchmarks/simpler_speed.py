@@ -47,6 +47,7 @@ def actions(slots: int, ticks: int = TICKS) -> np.ndarray:
 def running(task: str, slots: int, workers: int) -> SimplerEnv:
     episodes = [slot % NUM_EPISODES for slot in range(slots)]
     env = make(TASKS[task].suite, task=task, episodes=episodes, num_threads=workers)
+    assert isinstance(env, SimplerEnv)
     env.reset()
     env.step_continuous(np.zeros((slots, 7)))
     return env

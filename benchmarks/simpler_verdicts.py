@@ -113,6 +113,7 @@ json.dump(answers, open(sys.argv[2], 'w'))
 def record(task: str, episodes: int, kind: str) -> list[dict[str, Any]]:
     """Rollouts of a task: settled state, states and verdicts after every tick."""
     env = make(TASKS[task].suite, task=task, episodes=range(episodes), num_threads=1)
+    assert isinstance(env, SimplerEnv)
     info = env.reset()
     rollouts = [
         {"seed": episode_seed(slot), "joints": env.robot.joints, "settled": state(env, slot), "states": [], "ours": []}

@@ -164,6 +164,7 @@ def drift(profile: str) -> dict[SceneKey, np.ndarray]:
     found: dict[SceneKey, list[np.ndarray]] = {}
     for suite in suites.BASE_SUITES:
         env = make(suite, episodes=DRIFT_EPISODES, geometry=profile)
+        assert isinstance(env, LiberoEnv)
         env.reset()
         before = positions(env)
         env.step_continuous(np.tile(SETTLE_ACTION, (env.num_envs, IDLE_TICKS, 1)))
@@ -214,7 +215,9 @@ def rollout(suite: str, episodes: int, profile: str) -> tuple[np.ndarray, np.nda
         for _ in range(MAX_STEPS):
             if env.evaluate().success.all():
                 break
-            env.step_continuous(policy.act(env))
+            chosen = policy.act(env)
+            assert isinstance(chosen, np.ndarray)
+            env.step_continuous(chosen)
     success = env.evaluate().success
     env.close()
     return success, np.array(actions)

@@ -259,6 +259,10 @@ class BatchEnv(Protocol):
         """Verdicts."""
         ...
 
+    def end_episodes(self, slots: npt.ArrayLike) -> None:
+        """End the episodes of some slots: truncated, they ignore further steps until ``reset``."""
+        ...
+
     def state(self) -> State:
         """Physics state of every slot, a copy."""
         ...

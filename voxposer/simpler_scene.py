@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -164,6 +165,10 @@ class HandView:
         """Verdicts."""
         return self.env.evaluate()
 
+    def end_episodes(self, slots: npt.ArrayLike) -> None:
+        """End the episodes of some slots."""
+        self.env.end_episodes(slots)
+
     def state(self) -> State:
         """Physics state of every slot, a copy."""
         return self.env.state()
@@ -191,16 +196,27 @@ class HandView:
         converted[..., 6] = np.where(converted[..., 6] > 0, column.closed, column.open)
         return self.env.step_continuous(converted)
 
-    def step_ee_pose(self, poses: npt.ArrayLike, hold_steps: npt.ArrayLike = 0) -> EePoseControl:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def step_ee_pose(
+        self, poses: npt.ArrayLike | Mapping[str, object] | None, hold_steps: npt.ArrayLike = 0
+    ) -> EePoseControl:
         """Drive the hand to poses, [B, 8]; the final pose returned is the hand's."""
+        if poses is None or isinstance(poses, Mapping):
+            raise TypeError("poses of the hand are an array [B, 8]")
         converted = np.array(poses, float)
         if converted.size:
             converted[..., :7] = tool_poses(converted[..., :7])
         control = self.env.step_ee_pose(converted, hold_steps)
         return replace(control, final_pose=hand_poses(control.final_pose))
 
-    def step_waypoints(self, plan: SubtaskPlan, max_misses: int | None = None) -> PlanControl:
+    def step_waypoints(self, plan: object, max_misses: int | None = None) -> PlanControl:
         """Follow a plan of the hand."""
+        assert isinstance(plan, SubtaskPlan), "the agent's own plans only"
         control = self.env.step_waypoints(
             plan._replace(poses=tool_poses(np.asarray(plan.poses))), max_misses=max_misses
         )

@@ -235,7 +235,7 @@ class EpisodeLoop:
         self, number: int, running: _Running, slot: int, metrics: Metrics, control: Control, clocks: EpisodeClocks
     ) -> Record:
         """The record of a slot that has just finished."""
-        episode = running.slots[slot]
+        episode, seconds = running.slots[slot], clocks.seconds_of(slot)
         return Record(
             suite=episode.suite,
             task=episode.task,
@@ -251,7 +251,11 @@ class EpisodeLoop:
             sanitized_first=None if clocks.sanitized[slot] == 0 else int(clocks.sanitized_first[slot]),
             run=self._index,
             batch=number,
-            **clocks.seconds_of(slot),
+            setup_s=seconds["setup_s"],
+            wall_s=seconds["wall_s"],
+            policy_s=seconds["policy_s"],
+            physics_s=seconds["physics_s"],
+            images_s=seconds["images_s"],
             extras=extras_of(self._policy, slot),
             stand_ins=tuple(control.info["stand_ins"][slot]) if "stand_ins" in control.info else (),
         )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import vecenv
 from vecenv import protocols
 from vecenv.contract import BatchEnv
+from vecenv.libero.tasks.suites import list_tasks
 from vecenv.util.names import unknown
 from vecenv_eval.config import ConfigError
 from vecenv_eval.episodes import MAX_SLOTS, Suite
@@ -58,7 +59,7 @@ def describe_suite(name: str, protocol: str = protocols.DEFAULT) -> Suite:
         name=name,
         instructions=tuple(task.instruction for task in tasks),
         # SIMPLER's environments exchange scenes by themselves, so other tasks need no new environment.
-        scenes=tuple("" if simpler else task.problem().scene_key() for task in tasks),
+        scenes=("",) * len(tasks) if simpler else tuple(task.problem().scene_key() for task in list_tasks(name)),
         # LIBERO has 50 starts of every task, whatever a protocol runs of them.
         num_episodes=per_task if simpler else max(per_task, vecenv.eval_metadata(name)["episodes_per_task"]),
         every=None if simpler else per_task,

@@ -22,7 +22,6 @@ from vecenv.simpler.control.controllers import controller
 from vecenv.simpler.control.robots import GOOGLE_ROBOT, WIDOWX
 from vecenv.simpler.control.rotations import rotation_from_rotvec
 from vecenv.simpler.control.servo import Servo, ServoConfig
-from vecenv.simpler.env import SimplerEnv
 from vecenv.simpler.tasks import TASKS
 
 QPOS = np.array([-0.01840777, 0.0398835, 0.22242722, -0.00460194, 1.36524296, 0.00153398, 0.037, 0.037])
@@ -170,7 +169,7 @@ def test_it_solves_tasks_of_generated_assets(small: Path, task: str) -> None:
 
 
 def test_an_episode_that_cannot_be_solved_ends_with_its_budget(small: Path) -> None:
-    env: SimplerEnv = make("simpler/bridge", task="widowx_stack_cube", episodes=[0], assets=small, max_steps=5)
+    env = make("simpler/bridge", task="widowx_stack_cube", episodes=[0], assets=small, max_steps=5)
     policy, info = make_policy("simpler_scripted"), env.reset()
     policy.reset(env, info)
     control = policy.act(env)

@@ -6,20 +6,27 @@ Episode ``e`` of an even task solves itself after ``e + 2`` ticks; odd tasks run
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from contextlib import AbstractContextManager
+from typing import Any, Self
 
 import numpy as np
 from vecenv_eval.episodes import Suite
 from vecenv_eval.simulator import Simulator
 
-from vecenv.contract import Control, EePoseControl, Metrics, PlanControl, ResetInfo
+from vecenv.contract import Control, EePoseControl, Metrics, PlanControl, ResetInfo, State, Timings, Watcher
 from vecenv.observations import Egocentric, Objects
+from vecenv.placement import Placement
 
 SUITE = "fake_suite"
 
 
 class FakeEnv:
     """The verbs over a table of ticks: ``tasks`` times ``episodes`` slots."""
+
+    suite = SUITE
+    config: object = None
+    control_hz = 20.0
+    timings = Timings()
 
     def __init__(
         self,
@@ -121,8 +128,37 @@ class FakeEnv:
     def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
         return Objects(snapshot=(None,) * self.num_envs, error=("a fake has no objects",) * self.num_envs)
 
+    @property
+    def placement(self) -> Placement:
+        return Placement(self.tasks.copy(), self.episodes.copy())
+
+    @property
+    def done(self) -> np.ndarray:
+        return self.terminated | self.truncated
+
+    def instructions(self) -> tuple[str, ...]:
+        return tuple(f"do thing {task}" for task in self.tasks.tolist())
+
+    def end_episodes(self, slots: Any) -> None:
+        self.truncated[slots] |= ~self.terminated[slots]
+
+    def state(self) -> State:
+        raise AttributeError("a fake has no physics")
+
+    def set_state(self, state: State) -> None:
+        raise AttributeError("a fake has no physics")
+
+    def watched(self, watcher: Watcher) -> AbstractContextManager[None]:
+        raise AttributeError("a fake has no ticks to watch")
+
     def close(self) -> None:
         self.closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class FakeWorld:

@@ -159,7 +159,7 @@ class GoalStates:
     def _frame(self, row: goals.GoalTable) -> tuple[np.ndarray, np.ndarray]:
         site = int(row.site[0, 0])
         if site < 0:
-            return row.zone_pos[0, 0], row.zone_mat[0, 0]
+            return np.asarray(row.zone_pos[0, 0]), np.asarray(row.zone_mat[0, 0])
         return self.sim.data.site_xpos[site].copy(), self.sim.data.site_xmat[site].reshape(3, 3).copy()
 
     def _put(self, name: str, pos: np.ndarray) -> None:
@@ -192,7 +192,7 @@ class GoalStates:
             self._put(predicate.args[0], frame + mat.T @ delta)
 
         def resting(delta: np.ndarray) -> np.ndarray:
-            return delta if touch < 0 else self._first_touch(apply, delta, touch, low, high)
+            return delta if touch < 0 else self._first_touch(apply, delta, touch, float(low), float(high))
 
         def drawn() -> np.ndarray:
             return np.append(self.rng.uniform(-0.9, 0.9, 2) * size[:2], self.rng.uniform(low, high))

@@ -428,7 +428,9 @@ def test_a_policy_solves_as_many_tasks_with_lean_geometry() -> None:
         policy, info = make_policy("pick_place"), env.reset()
         policy.reset(env, info)
         while not (env.evaluate().success | (env.evaluate().num_steps >= 300)).all():
-            env.step_continuous(policy.act(env))
+            actions = policy.act(env)
+            assert isinstance(actions, np.ndarray)
+            env.step_continuous(actions)
         solved.append(env.evaluate().success.mean())
         env.close()
     assert abs(solved[1] - solved[0]) <= 0.05

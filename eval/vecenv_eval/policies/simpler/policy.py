@@ -54,7 +54,7 @@ class SimplerScriptedPolicy:
         """
         if not isinstance(env, SimplerEnv):
             raise TypeError(f"{self.name} works on SIMPLER's suites, not on {info.suite}")
-        self._arm = Arm(env.robot, env.config.assets or assets.simpler_root())
+        self._arm = Arm(env.robot, assets.simpler_root(env.config.assets))
         self._slots = [_Slot() for _ in range(env.num_envs)]
 
     def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
