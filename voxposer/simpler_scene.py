@@ -154,8 +154,8 @@ class HandView:
     def set_episodes(
         self,
         *,
-        tasks: npt.ArrayLike | None = None,
-        episodes: npt.ArrayLike | None = None,
+        tasks: object = None,
+        episodes: object = None,
         slots: npt.ArrayLike | None = None,
     ) -> None:
         """Choose what each slot runs next, or some slots."""
