@@ -45,7 +45,12 @@ def evaluate(
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
         StoreError: the folder cannot be made.
     """
-    evaluation = Evaluation(config, simulator)
+    try:
+        evaluation = Evaluation(config, simulator)
+    except ConfigError:
+        if isinstance(store, ResultStore):
+            store.discard()  # a folder without episodes
+        raise
     if not isinstance(store, ResultStore):
         store = begin(config, store or default_folder(RESULTS, config.suite, config.policy_name))
     return evaluation.run(store, on_progress)

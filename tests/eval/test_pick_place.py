@@ -187,11 +187,11 @@ class StillEnv:
     def __init__(self, *snapshots: ObjectsSnapshot | None) -> None:
         self.snapshots, self.num_envs = snapshots, len(snapshots)
 
-    def observe_objects(self, points: str = "surface") -> Objects:
-        del points
+    def observe_objects(self, points: str = "surface", slots: Any = None) -> Objects:
+        del points, slots
         return Objects(self.snapshots, ("",) * self.num_envs)
 
-    def observe_egocentric(self) -> Egocentric:
+    def observe_egocentric(self, slots: Any = None) -> Egocentric:
         state = np.zeros((self.num_envs, 8), np.float32)
         state[:, 2:4] = 0.5, np.pi
         return Egocentric(state=state)

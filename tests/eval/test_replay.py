@@ -424,7 +424,7 @@ def test_fixture_poses_that_differ_between_slots_are_each_slots_own(tmp_path: Pa
 
 
 def test_an_environment_that_hides_its_actions_is_not_recorded(tmp_path: Path) -> None:
-    with pytest.raises(RecordError, match="FakeEnv does not show the actions it executes"):
+    with pytest.raises(RecordError, match="Blind does not show the actions it executes"):
         Recorder(Blind([0], [0]), [0], {})
     result = record(tmp_path / "r", FakeWorld(), tasks="0")
     assert result.causes == ("RecordError: FakeEnv does not show the actions it executes, so it cannot be recorded",)

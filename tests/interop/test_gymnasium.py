@@ -456,6 +456,7 @@ def test_the_budget_of_an_episode_can_be_given_by_gymnasiums_name() -> None:
 # -- SIMPLER -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space:UserWarning")
 def test_a_simpler_task_has_an_id_and_passes_the_checker(small: Path) -> None:
     pytest.importorskip("sapien")
     options: dict[str, Any] = {"assets": small, "num_threads": 1, "obs": "state", "max_steps": 3}

@@ -92,9 +92,11 @@ def websocket_host(handle: Callable[[WebSocketHost, ServerConnection, int], None
         host.port = server.socket.getsockname()[1]
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
-        yield host
-        server.shutdown()
-        thread.join()
+        try:
+            yield host
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def messages(connection: ServerConnection) -> Iterator[bytes]:
@@ -110,9 +112,11 @@ def running(server: Any) -> Iterator[int]:
     ports: SimpleQueue[int] = SimpleQueue()
     thread = threading.Thread(target=server.run, args=(ports.put,), daemon=True)
     thread.start()
-    yield ports.get(timeout=20)
-    server.stop()
-    thread.join(timeout=20)
+    try:
+        yield ports.get(timeout=20)
+    finally:
+        server.stop()
+        thread.join(timeout=20)
     assert not thread.is_alive()
 
 

@@ -474,6 +474,7 @@ def test_the_same_request_gets_the_same_reply_in_every_process() -> None:
     assert len(replies) == 1
 
 
+@pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
 def test_litellm_gets_programs_tokens_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.fail("the offline writer used the network"))
     offline.register()

@@ -45,10 +45,10 @@ def make_options(make: Callable[..., BatchEnv], **arguments: Any) -> dict[str, A
 
 
 def _defaults(make: Callable[..., BatchEnv]) -> dict[str, Any]:
-    """Options of ``make`` with their defaults: its own, and the fields of ``LiberoConfig`` where it takes any."""
+    """Options of ``make`` with their defaults: its own, and of ``vecenv.make`` the fields of ``LiberoConfig``."""
     parameters = inspect.signature(make).parameters.values()
     found = {each.name: each.default for each in parameters if each.default is not each.empty}
-    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+    if make is vecenv.make:
         found |= {each.name: each.default for each in fields(vecenv.LiberoConfig)}
     return found
 

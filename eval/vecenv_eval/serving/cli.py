@@ -7,6 +7,7 @@ the arguments make no sense.
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
 from pathlib import Path
 
@@ -42,6 +43,8 @@ def serve_policy_command(
         server = server_class(load(policy), host, usual_port if port is None else port)
     except (ServedPolicyError, MissingDependency) as error:
         fail(str(error))
+    # A shell that starts it in the background makes it deaf to Ctrl-C's signal; `kill -INT` must still stop it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         server.run(lambda bound: typer.echo(f"serving {policy} as {protocol} on {server.scheme}://{host}:{bound}"))
     except OSError as error:

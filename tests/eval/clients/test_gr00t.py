@@ -75,11 +75,13 @@ def rep_server(answer: Callable[[bytes], object], release: str = codec.N1_6, por
 
         thread = threading.Thread(target=run, daemon=True)
         thread.start()
-        yield bound
-        with context.socket(zmq.PAIR) as stop:
-            stop.connect("inproc://stop")
-            stop.send(b"")
-            thread.join(timeout=20)
+        try:
+            yield bound
+        finally:
+            with context.socket(zmq.PAIR) as stop:
+                stop.connect("inproc://stop")
+                stop.send(b"")
+                thread.join(timeout=20)
 
 
 def policy_of(port: int, **options: Any) -> Policy:

@@ -211,15 +211,18 @@ def test_the_command_serves_until_it_is_interrupted(module: Path) -> None:
     run = "import typer; from vecenv_eval.serving.cli import serve_policy_command as c; typer.run(c)"
     command = [sys.executable, "-c", run, "a_served_policy:still", "--as", "openpi", "--port", "0"]
     with subprocess.Popen(command, cwd=module, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        assert line.startswith("serving a_served_policy:still as openpi on ws://127.0.0.1:")
-        env = SeeingEnv([1], [0])
-        client: Policy = make_policy("openpi", **{**QUICK, "port": int(line.rpartition(":")[2]), "replan_steps": 1})
-        client.reset(env, env.reset())
-        assert not np.asarray(client.act(env)).any()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 0
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith("serving a_served_policy:still as openpi on ws://127.0.0.1:")
+            env = SeeingEnv([1], [0])
+            client: Policy = make_policy("openpi", **{**QUICK, "port": int(line.rpartition(":")[2]), "replan_steps": 1})
+            client.reset(env, env.reset())
+            assert not np.asarray(client.act(env)).any()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 0
+        finally:
+            process.kill()  # leaving the block waits for its end
 
 
 def test_the_command_is_announced_to_the_command_line(repository: Path) -> None:

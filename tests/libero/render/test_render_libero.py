@@ -130,7 +130,7 @@ def test_there_are_all_cameras_of_the_scene_and_ones_own(env: LiberoEnv) -> None
     seen = env.observe_egocentric()
     assert {"agentview", "wrist", "robot0_eye_in_hand", "frontview", "birdview", "overhead"} <= set(seen.images)
     assert seen.images["overhead"].any()
-    with pytest.raises(ImagesUnavailable, match=r"no depth image of camera 'sky': there are: .*agentview"):
+    with pytest.raises(ImagesUnavailable, match=r"no depth image of camera 'sky': available: .*agentview"):
         seen.points_from_pixels("sky", np.zeros((1, 2)))
 
 
