@@ -406,12 +406,6 @@ def test_a_fault_is_on_record(tmp_path: Path) -> None:
     assert (demo["success"], demo["fault"], len(demo["actions"])) == (False, "it flew away", 1)
 
 
-class Blind(FakeEnv):
-    """An environment that shows neither states nor ticks."""
-
-    state = watched = property(FakeEnv.state)  # type: ignore[assignment]
-
-
 def test_fixture_poses_that_differ_between_slots_are_each_slots_own(tmp_path: Path) -> None:
     env = Visible([0], [0, 1])
     poses = {"shelf": (np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([1.0, 0, 0, 0]))}
@@ -424,8 +418,8 @@ def test_fixture_poses_that_differ_between_slots_are_each_slots_own(tmp_path: Pa
 
 
 def test_an_environment_that_hides_its_actions_is_not_recorded(tmp_path: Path) -> None:
-    with pytest.raises(RecordError, match="Blind does not show the actions it executes"):
-        Recorder(Blind([0], [0]), [0], {})
+    with pytest.raises(RecordError, match="FakeEnv does not show the actions it executes"):
+        Recorder(FakeEnv([0], [0]), [0], {})
     result = record(tmp_path / "r", FakeWorld(), tasks="0")
     assert result.causes == ("RecordError: FakeEnv does not show the actions it executes, so it cannot be recorded",)
 

@@ -39,14 +39,16 @@ class Recorder:
     def __init__(
         self, env: BatchEnv, episodes: Sequence[int], options: Mapping[str, Any], *, states: bool = False
     ) -> None:
-        if not (hasattr(env, "watched") and hasattr(env, "state")):
-            raise RecordError(f"{type(env).__name__} does not show the actions it executes, so it cannot be recorded")
         self._env, self._options, self._with_states = env, options, states
         self._episodes = list(episodes)
         count = len(self._episodes)
         self._actions: list[list[np.ndarray]] = [[] for _ in range(count)]
         self._states: list[list[np.ndarray]] = [[] for _ in range(count)]
-        state = env.state()
+        try:
+            state = env.state()
+        except AttributeError as error:
+            what = f"{type(env).__name__} does not show the actions it executes, so it cannot be recorded"
+            raise RecordError(what) from error
         self._start = [flat_state(state, slot) for slot in range(count)]
         self._ended: dict[int, tuple[bool, str, np.ndarray]] = {}
 
