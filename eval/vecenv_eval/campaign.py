@@ -1,8 +1,8 @@
 """Several suites and several seeds as one evaluation, averaged as papers print it.
 
 An ``EvalConfig`` that names more than one suite or seed comes in. Each pair of suite and seed is a run of its own, with
-a results folder of its own inside the campaign's (``DIR/libero_goal``, ``DIR/libero_goal/seed-1``), so everything that
-reads a results folder reads each of them. Out: :class:`CampaignSummary`, also ``summary.json`` and ``report.md``.
+a results folder of its own inside the campaign's (``DIR/libero_goal``, or ``DIR/seed-1/libero_goal``), so everything
+that reads a results folder reads each of them. Out: :class:`CampaignSummary`, also ``summary.json`` and ``report.md``.
 """
 
 from __future__ import annotations
@@ -99,10 +99,8 @@ def legs(config: EvalConfig, folder: Path) -> list[Leg]:
     for suite in config.suites:
         for seed in config.all_seeds:
             own = replace(config, suite=suite, seed=seed, seeds=None, policy=config.policy)
-            place = folder / suite.replace("/", "-")
-            made.append(
-                Leg(suite=suite, seed=seed, config=own, folder=place / f"seed-{seed}" if config.seeds else place)
-            )
+            place = folder / f"seed-{seed}" if config.seeds else folder
+            made.append(Leg(suite=suite, seed=seed, config=own, folder=place / suite.replace("/", "-")))
     return made
 
 

@@ -12,6 +12,7 @@ from support.fakes import FakeEnv, FakeWorld
 from vecenv_eval.campaign import CAMPAIGN, Campaign, is_campaign, legs, markdown
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.episodes import Suite
+from vecenv_eval.report.run import read_run
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.store import ResultStore, StoreError
 
@@ -63,7 +64,7 @@ def test_every_pair_has_a_results_folder_of_its_own(tmp_path: Path) -> None:
     assert worlds.made == [("libero_goal", 0), ("libero_goal", 7), ("libero_10", 0), ("libero_10", 7)]
     assert all(result.ok for result in results)
     for leg in campaign.legs:
-        assert leg.folder == tmp_path / "c" / leg.suite / f"seed-{leg.seed}"
+        assert leg.folder == tmp_path / "c" / f"seed-{leg.seed}" / leg.suite
         assert len(ResultStore.open(leg.folder).records()) == 20
     assert [row.rates for row in summary.suites] == [(0.5, 0.5)] * 2
     assert (summary.average, summary.average_std) == (0.5, 0.0)
@@ -120,3 +121,10 @@ def test_a_folder_in_the_way_is_left_alone(tmp_path: Path) -> None:
         Campaign(config(), tmp_path, Worlds().simulator).run()
     with pytest.raises(StoreError, match=CAMPAIGN):
         Campaign.open(tmp_path / "elsewhere")
+
+
+def test_a_report_of_several_seeds_asks_which(tmp_path: Path) -> None:
+    Campaign(config(seeds="0,7"), tmp_path / "c", Worlds().simulator).run()
+    with pytest.raises(StoreError, match=r"several seeds: name one, or two to compare them: .*seed-0, .*seed-7"):
+        read_run(tmp_path / "c")
+    assert [suite.suite for suite in read_run(tmp_path / "c" / "seed-7").suites] == ["libero_goal", "libero_10"]

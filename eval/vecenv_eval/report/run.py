@@ -120,6 +120,10 @@ def read_run(folder: Path) -> Run:
     if not folder.is_dir():
         raise StoreError(f"{folder} is not a results folder: there is no such folder")
     inside = [folder] if (folder / CONFIG).is_file() else sorted(path.parent for path in folder.glob(f"*/{CONFIG}"))
+    seeds = sorted({path.parent.parent for path in folder.glob(f"*/*/{CONFIG}")})
+    if not inside and seeds:
+        names = ", ".join(map(str, seeds))
+        raise StoreError(f"{folder} holds runs with several seeds: name one, or two to compare them: {names}")
     if not inside:
         raise StoreError(f"{folder} is not a results folder: neither it nor a folder in it has a {CONFIG}")
     found = [suite for each in inside for suite in _read_folder(each)]
