@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from vecenv_eval.clients.base import RemotePolicy
 from vecenv_eval.clients.codecs import numpy_msgpack
 from vecenv_eval.clients.config import ServerConfig, build
 from vecenv_eval.clients.frames import Frames
+from vecenv_eval.clients.greeting import GreetedPolicy
 from vecenv_eval.clients.images import resize_with_pad
-from vecenv_eval.clients.pool import LinkPool
-from vecenv_eval.clients.websocket import Exchange, WebSocketLink
+from vecenv_eval.clients.websocket import Exchange
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,30 +43,17 @@ class OpenPiConfig(ServerConfig):
     prompt_key: str = "prompt"
 
 
-class OpenPiPolicy(RemotePolicy[OpenPiConfig]):
+class OpenPiPolicy(GreetedPolicy[OpenPiConfig]):
     """A policy behind openpi's websocket server.
 
     Args:
         **options: fields of ``OpenPiConfig``.
-
-    Attributes:
-        metadata: what the server said about itself when it was last connected to.
     """
 
     name = "openpi"
 
     def __init__(self, **options: object) -> None:
         super().__init__(build(OpenPiConfig, self.name, options))
-        self.metadata: Mapping[str, Any] = {}
-        links = [WebSocketLink(self.config, self.server, self._greet) for _ in range(self.config.connections)]
-        self._links = LinkPool(links)
-
-    def close(self) -> None:
-        """Close the connections; the next call opens them again."""
-        self._links.close()
-
-    def _greet(self, exchange: Exchange) -> None:
-        self.metadata = numpy_msgpack.unpack(exchange.receive())
 
     def _cameras(self) -> Sequence[str]:
         return ("agentview", "wrist") if self.config.wrist_key else ("agentview",)

@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from vecenv_eval.clients.base import RemotePolicy
 from vecenv_eval.clients.codecs import numpy_msgpack
 from vecenv_eval.clients.config import ServerConfig, build
 from vecenv_eval.clients.frames import Frames
+from vecenv_eval.clients.greeting import GreetedPolicy
 from vecenv_eval.clients.images import resize
-from vecenv_eval.clients.pool import LinkPool
-from vecenv_eval.clients.websocket import Exchange, WebSocketLink
+from vecenv_eval.clients.websocket import Exchange
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,30 +50,17 @@ class StarVLAConfig(ServerConfig):
     num_ddim_steps: int = 10
 
 
-class StarVLAPolicy(RemotePolicy[StarVLAConfig]):
+class StarVLAPolicy(GreetedPolicy[StarVLAConfig]):
     """A policy behind StarVLA's websocket server.
 
     Args:
         **options: fields of ``StarVLAConfig``.
-
-    Attributes:
-        metadata: what the server said about itself when it was last connected to.
     """
 
     name = "starvla"
 
     def __init__(self, **options: object) -> None:
         super().__init__(build(StarVLAConfig, self.name, options))
-        self.metadata: Mapping[str, Any] = {}
-        links = [WebSocketLink(self.config, self.server, self._greet) for _ in range(self.config.connections)]
-        self._links = LinkPool(links)
-
-    def close(self) -> None:
-        """Close the connections; the next call opens them again."""
-        self._links.close()
-
-    def _greet(self, exchange: Exchange) -> None:
-        self.metadata = numpy_msgpack.unpack(exchange.receive())
 
     def _cameras(self) -> Sequence[str]:
         return ("agentview", "wrist") if self.config.wrist else ("agentview",)
