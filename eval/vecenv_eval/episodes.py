@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby, islice, pairwise, product
+from itertools import groupby, product
+from typing import TypeVar
 
 from vecenv.placement import ALL, SpecError, parse_episodes, parse_tasks
 
@@ -26,6 +27,7 @@ __all__ = [
     "streams",
 ]
 
+_Item = TypeVar("_Item")
 # Scenes of a suite that run side by side; drawing one takes up to 0.9 GB.
 MAX_SCENES = 5
 # Most episodes that run at once, where neither the user nor the suite sets another number.
@@ -145,12 +147,11 @@ def _rectangles(suite: str, tasks: Sequence[int], episodes: Sequence[int], num_e
             yield Batch(suite, some_tasks, some_episodes)
 
 
-def _even_chunks(items: Sequence[int], most: int) -> Iterator[tuple[int, ...]]:
+def _even_chunks(items: Sequence[_Item], most: int) -> Iterator[tuple[_Item, ...]]:
     """Split into as few chunks of at most ``most`` as possible, their sizes differing by at most one."""
     count = -(-len(items) // most)
-    bounds = [len(items) * i // count for i in range(count + 1)]
-    for start, stop in pairwise(bounds):
-        yield tuple(items[start:stop])
+    for i in range(count):
+        yield tuple(items[len(items) * i // count : len(items) * (i + 1) // count])
 
 
 @dataclass(frozen=True)
@@ -213,7 +214,7 @@ def streams(
         missing = [each for each in (Episode(suite.name, task, e) for e in episodes[task]) if each not in done]
         if missing:
             todo.setdefault(suite.scenes[task], []).extend(missing)
-    return [_stream(suite, some, todo, num_envs) for some in _chunks(list(todo), min(MAX_SCENES, num_envs))]
+    return [_stream(suite, some, todo, num_envs) for some in _even_chunks(list(todo), min(MAX_SCENES, num_envs))]
 
 
 def _stream(suite: Suite, scenes: Sequence[Hashable], todo: Mapping[Hashable, list[Episode]], num_envs: int) -> Stream:
@@ -233,10 +234,3 @@ def _shares(wanted: Sequence[int], most: int) -> list[int]:
     while sum(shares) < most:
         shares[max(range(len(wanted)), key=lambda i: wanted[i] / shares[i])] += 1
     return shares
-
-
-def _chunks(items: Sequence[Hashable], most: int) -> Iterator[tuple[Hashable, ...]]:
-    """The items in chunks of ``most``, the last perhaps shorter."""
-    rest = iter(items)
-    while chunk := tuple(islice(rest, most)):
-        yield chunk
