@@ -17,8 +17,8 @@ from typing import Any
 
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.results import EvalResult, Progress, begin, resume
-from vecenv_eval.runner import Evaluation
-from vecenv_eval.simulator import Simulator
+from vecenv_eval.runner import Evaluation, check
+from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import CONFIG, REPORT, SUMMARY, StoreError
 
 CAMPAIGN = "campaign.json"
@@ -98,7 +98,7 @@ def legs(config: EvalConfig, folder: Path) -> list[Leg]:
     made = []
     for suite in config.suites:
         for seed in config.all_seeds:
-            own = replace(config, suite=suite, seed=seed, seeds=None, policy=config.policy)
+            own = replace(config, suite=suite, seed=seed, seeds=None)
             place = folder / f"seed-{seed}" if config.seeds else folder
             made.append(Leg(suite=suite, seed=seed, config=own, folder=place / suite.replace("/", "-")))
     return made
@@ -120,7 +120,7 @@ class Campaign:
         self.config, self.folder, self._simulator = config, folder, simulator
         self.legs = legs(config, folder)
         for leg in self.legs:
-            Evaluation(leg.config, simulator)
+            check(leg.config, simulator or vecenv_simulator())
 
     @classmethod
     def open(cls, folder: Path, simulator: Simulator | None = None) -> Campaign:
@@ -151,6 +151,7 @@ class Campaign:
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / CAMPAIGN).write_text(json.dumps(self.config.to_dict(), indent=2) + "\n")
         results: list[EvalResult] = []
+        summary = summarise((), ())
         for leg in self.legs:
             begun = (leg.folder / CONFIG).exists()
             config, store = resume(leg.folder) if begun else (leg.config, begin(leg.config, leg.folder))
@@ -161,10 +162,10 @@ class Campaign:
             result = Evaluation(config, self._simulator).run(store, report)
             results.append(result)
             on_result(leg, result)
-            self._write(results)
+            summary = self._write(results)
             if result.interrupted:
                 break
-        return self._write(results), results
+        return summary, results
 
     def _write(self, results: Sequence[EvalResult]) -> CampaignSummary:
         summary = summarise(self.legs[: len(results)], results)

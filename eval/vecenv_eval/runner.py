@@ -18,7 +18,7 @@ from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
 from vecenv_eval.loop import EpisodeLoop
-from vecenv_eval.policies import Closing, Refillable, make_policy
+from vecenv_eval.policies import Closing, Refillable, check_policy, make_policy
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.report import markdown, summarise
 from vecenv_eval.results import EvalResult, Progress, begin
@@ -70,11 +70,7 @@ class Evaluation:
     def __init__(self, config: EvalConfig, simulator: Simulator | None = None) -> None:
         self.config = config
         self.simulator = simulator or vecenv_simulator()
-        self.suite = self.simulator.suite(config.suite, config.protocol)
-        self.tasks, self.episodes = _chosen_episodes(config, self.suite)
-        _check_make(self.simulator, config)
-        _check_record(config)
-        _check_policy(config)
+        self.suite, self.tasks, self.episodes = check(config, self.simulator)
         self.policy = make_policy(config.policy_name, seed=_policy_seed(config), **config.policy_args)
 
     @property
@@ -142,6 +138,21 @@ class Evaluation:
             interrupted=interrupted,
             causes=causes,
         )
+
+
+def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, ...], dict[int, tuple[int, ...]]]:
+    """Check a config without making its policy; gives the suite, the tasks, and the episodes of each.
+
+    Raises:
+        ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
+    """
+    suite = simulator.suite(config.suite, config.protocol)
+    tasks, episodes = _chosen_episodes(config, suite)
+    _check_make(simulator, config)
+    _check_record(config)
+    _check_policy(config)
+    check_policy(config.policy_name, **config.policy_args)
+    return suite, tasks, episodes
 
 
 def _policy_seed(config: EvalConfig) -> int:

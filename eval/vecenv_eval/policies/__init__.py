@@ -10,6 +10,7 @@ import difflib
 import importlib
 import inspect
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -120,19 +121,28 @@ def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
     Raises:
         PolicyError: the name is unknown, its module does not import, or it does not take the arguments.
     """
-    factory = _load(name)
-    parameters = inspect.signature(factory).parameters
-    if "seed" in parameters:
-        arguments = {"seed": seed, **arguments}
-    try:
-        inspect.signature(factory).bind(**arguments)
-    except TypeError as error:
-        takes = ", ".join(parameters) or "none"
-        raise PolicyError(f"policy {name!r}: {error}; arguments it takes: {takes}") from None
-    policy = factory(**arguments)
+    policy = _bound(name, seed, arguments)()
     if not isinstance(policy, Policy):
         raise PolicyError(f"policy {name!r} is not a policy: it needs a name, reset(env, info) and act(env)")
     return policy
+
+
+def check_policy(name: str, **arguments: Any) -> None:
+    """Raise what ``make_policy`` raises before it makes the policy, which may be a large model."""
+    _bound(name, 0, arguments)
+
+
+def _bound(name: str, seed: int, arguments: Mapping[str, Any]) -> Callable[[], Any]:
+    """What makes the policy, with its arguments."""
+    factory = _load(name)
+    parameters = inspect.signature(factory).parameters
+    given = {"seed": seed, **arguments} if "seed" in parameters else dict(arguments)
+    try:
+        inspect.signature(factory).bind(**given)
+    except TypeError as error:
+        takes = ", ".join(parameters) or "none"
+        raise PolicyError(f"policy {name!r}: {error}; arguments it takes: {takes}") from None
+    return partial(factory, **given)
 
 
 def _load(name: str) -> Callable[..., object]:
