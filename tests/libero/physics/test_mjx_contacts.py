@@ -146,6 +146,37 @@ def test_boxes_touch_as_in_mujoco_3_3_0_to_single_precision(
     assert same >= PAIRS * (1 - decided_by_rounding)
 
 
+def barely_touching(count: int) -> np.ndarray:
+    """Pairs of thin boxes [count, 31] whose edges cross, at a distance below what single precision resolves."""
+    rng, poses = np.random.default_rng(3), np.zeros((count, 31))
+    for pose in poses:
+        sizes = np.exp(rng.uniform(np.log(0.001), np.log(0.05), (2, 3)))
+        first, second = rotation(rng.normal(size=4)), rotation(rng.normal(size=4))
+        axis = np.cross(first[:, rng.integers(3)], second[:, rng.integers(3)])
+        axis /= np.linalg.norm(axis)
+        corners = [np.sign(axis @ first) * sizes[0], -np.sign(axis @ second) * sizes[1]]
+        # Along the edges, their middles meet.
+        ends = [
+            np.where(np.abs(axis @ box) < 1e-9, 0, corner) for box, corner in zip((first, second), corners, strict=True)
+        ]
+        place = rng.uniform(-0.5, 0.5, 3)
+        away = first @ ends[0] - second @ ends[1] - axis * rng.uniform(-1e-7, 1e-7)
+        pose[:30] = [*place, *first.ravel(), *sizes[0], *(place + away), *second.ravel(), *sizes[1]]
+    return poses
+
+
+@pytest.mark.parametrize("collide", [on_warp, on_jax])
+def test_boxes_whose_edges_barely_touch_are_thrown_apart_only_where_mujoco_3_3_0_does(
+    collide: Callable[[np.ndarray], Rows],
+) -> None:
+    poses = barely_touching(20_000).astype(np.float32).astype(float)
+    found = collide(poses)
+    deepest = np.where(np.arange(MOST) < found.count[:, None], found.dist, 0).min(1)
+    assert (found.count > 0).mean() > 0.2
+    for number in np.flatnonzero(deepest < -1e-5):
+        assert wanted(poses[number])[:, 0].min(initial=0) == pytest.approx(deepest[number], abs=1e-5)
+
+
 @pytest.mark.parametrize("collide", [on_warp, on_jax])
 def test_boxes_that_lie_square_on_each_other_touch_with_half_the_overlap(collide: Callable[[np.ndarray], Rows]) -> None:
     poses, rng = np.zeros((PAIRS, 31)), np.random.default_rng(2)

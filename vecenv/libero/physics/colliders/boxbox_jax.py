@@ -315,7 +315,9 @@ def _edge_contacts(
     vertices = _edge_vertices(quad, flat, half, rise, crossed, have, margin)
     found = jax.tree.map(lambda *parts: jnp.concatenate(parts), lines, corners, vertices)
     points = ((found.points + jnp.array([0, 0, 1]) * half[2])[:, :, None] * frame).sum(1)
-    return _Found(points, found.depth, found.valid & usable), axis * sign
+    # Without a crossing the boxes do not overlap: what seems deep is rounding, see ``boxbox_warp``.
+    sound = crossed | (found.depth >= 0)
+    return _Found(points, found.depth, found.valid & usable & sound), axis * sign
 
 
 def _along_and_face(edge: jax.Array, beside: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -4,9 +4,15 @@ Method, order of the contacts and halved depth of face contacts are those of ``v
 which explains them; signature and result are those of MuJoCo Warp's own ``box_box``, which it replaces
 (``vecenv.libero.physics.mjx.contacts``). Everything is float32, in the world frame, metres.
 
-Single precision requires one difference. An axis made of two nearly parallel edges is only as accurate as the cross
-product of the edges, and where boxes rest flat on each other its overlap ties with that of a face: it is chosen only if
-its overlap is smaller by more than the rounding error.
+Single precision requires two differences.
+
+* An axis made of two nearly parallel edges is only as accurate as the cross product of the edges, and where boxes rest
+  flat on each other its overlap ties with that of a face: it is chosen only if its overlap is smaller by more than the
+  rounding error.
+* Boxes whose edges touch within the rounding error may overlap along the axis while no side of the projected face
+  crosses the rectangle at their depth. MuJoCo 3.3.0 then takes corners that are far from the edges, centimetres deep,
+  and throws the boxes apart; in double precision the coincidence is a hundred times as rare. Boxes without a crossing
+  do not overlap, so a negative distance is dropped there.
 """
 
 # In Warp, int(0) makes a variable that a loop may change; a literal is a constant.
@@ -359,10 +365,13 @@ def _edge_contacts(
     lines = count
     count, found = _edge_corners(found, count, quad, flat_quad, half, margin)
     count, found = _edge_vertices(found, lines, count, quad, flat_quad, half, rise, margin)
+    kept = int(0)
     for n in range(count):
-        point = wp.transpose(frame) @ wp.vec3(found[n, 0], found[n, 1], found[n, 2] + half[2])
-        found[n] = wp.vec4(point[0], point[1], point[2], found[n, 3])
-    return count, found, normal
+        if lines > 0 or found[n, 3] >= 0.0:
+            point = wp.transpose(frame) @ wp.vec3(found[n, 0], found[n, 1], found[n, 2] + half[2])
+            found[kept] = wp.vec4(point[0], point[1], point[2], found[n, 3])
+            kept += 1
+    return kept, found, normal
 
 
 @wp.func
