@@ -9,9 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import filmed
 from support.fakes import SUITE, FakeWorld
 from vecenv_eval.config import ConfigError, EvalConfig, parse_shard
 from vecenv_eval.episodes import Episode, Suite, shard
@@ -19,6 +22,8 @@ from vecenv_eval.merge import merge
 from vecenv_eval.results import EvalResult, resume
 from vecenv_eval.runner import Evaluation, evaluate
 from vecenv_eval.store import Record, ResultStore, StoreError
+from vecenv_eval.video.episodes import video_path
+from vecenv_eval.watch import watching
 
 
 def run(folder: Path, world: FakeWorld | None = None, **settings: Any) -> EvalResult:
@@ -79,7 +84,7 @@ def test_a_shard_is_read_and_the_whole_is_one() -> None:
     assert (parse_shard("2/5"), parse_shard(None)) == ((2, 5), (1, 1))
 
 
-@pytest.mark.parametrize("parts", [1, 2, 3, 7, 25])
+@pytest.mark.parametrize("parts", [1, 2, 3, 25])
 def test_merged_shards_are_what_one_run_leaves(tmp_path: Path, parts: int) -> None:
     whole = run(tmp_path / "whole")
     merged = join(tmp_path / "merged", shards(tmp_path, parts))
@@ -264,3 +269,88 @@ def test_a_run_may_write_while_it_is_merged(tmp_path: Path) -> None:
     path.write_text(text[:-30])  # its last row is being written
     assert join(tmp_path / "merged", [a, b]).summary.total.missing == 1
     assert path.read_text() == text[:-30]
+
+
+def test_recordings_and_videos_of_merged_rows_are_copied(tmp_path: Path) -> None:
+    settings = {"suite": "libero_object", "policy": "random", "tasks": "0-1", "episodes": "3", "max_steps": 4}
+    folders = [tmp_path / "a", tmp_path / "b"]
+    for part, folder in enumerate(folders, start=1):
+        result = evaluate(EvalConfig(**settings, record=True, shard=f"{part}/2"), folder)
+        for record in result.records:
+            path = video_path(folder, record.key)
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(record.key.id)
+    for count in (1, 2, 2):  # as they finish, and again
+        (merged,) = merge(tmp_path / "merged", folders[:count]).results
+    assert merged.ok
+    for record in merged.records:
+        assert video_path(tmp_path / "merged", record.key).read_text() == record.key.id
+    for folder in folders:
+        for path in (folder / "demos").iterdir():
+            with h5py.File(path) as file, h5py.File(tmp_path / "merged" / "demos" / path.name) as copy:
+                assert {**copy["data"].attrs, "num_demos": 0, "total": 0} == {
+                    **file["data"].attrs,
+                    "num_demos": 0,
+                    "total": 0,
+                }
+                for name, demo in file["data"].items():
+                    assert np.array_equal(copy["data"][name]["actions"], demo["actions"])
+                    assert copy["data"][name].attrs["make"] == demo.attrs["make"]
+    with h5py.File(tmp_path / "merged" / "demos" / "libero_object_0.hdf5") as file:
+        assert file["data"].attrs["num_demos"] == 3
+        assert file["data"].attrs["total"] == 12
+
+
+def test_lerobot_datasets_are_joined_as_one_run_would_have_written_them(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("av")
+    from vecenv_eval.datasets.join import copy_episodes
+    from vecenv_eval.datasets.lerobot import DatasetError
+
+    stove = filmed.record(5, False, instruction="turn on the stove")
+    outcomes = [(3, filmed.record(4)), (2, stove), (4, filmed.record(6))]
+    film(tmp_path / "whole", outcomes)
+    film(tmp_path / "a", outcomes[:1])
+    film(tmp_path / "b", outcomes[1:], begun=3)
+    every = [outcome.key for _, outcome in outcomes]
+    assert copy_episodes(tmp_path / "a", tmp_path / "merged", every) == 1
+    assert copy_episodes(tmp_path / "b", tmp_path / "merged", every[:2]) == 1
+    assert copy_episodes(tmp_path / "b", tmp_path / "merged", every) == 1
+    assert copy_episodes(tmp_path / "b", tmp_path / "merged", every) == 0
+    info, stats = "meta/info.json", "meta/stats.json"
+    assert json.loads((tmp_path / "merged" / info).read_text()) == json.loads((tmp_path / "whole" / info).read_text())
+    for name, ours in json.loads((tmp_path / "merged" / stats).read_text()).items():
+        for which, theirs in json.loads((tmp_path / "whole" / stats).read_text())[name].items():
+            np.testing.assert_allclose(ours[which], theirs, err_msg=f"{name} {which}")
+    assert frames(tmp_path / "merged") == frames(tmp_path / "whole")
+    assert len(frames(tmp_path / "merged")) == 9
+    for path in sorted((tmp_path / "whole").rglob("*.mp4")):
+        copy = tmp_path / "merged" / path.relative_to(tmp_path / "whole")
+        assert copy.read_bytes() == path.read_bytes()
+    film(tmp_path / "other", [(2, filmed.record(7))], env=filmed.FilmedEnv(state=9))
+    with pytest.raises(DatasetError, match=r"observation.state of libero_goal/1/7 is \[9\]"):
+        copy_episodes(tmp_path / "other", tmp_path / "merged", [filmed.record(7).key])
+    (tmp_path / "b" / "meta/info.json").write_text("{")
+    with pytest.raises(DatasetError, match="/b cannot be read"):
+        copy_episodes(tmp_path / "b", tmp_path / "merged", every)
+
+
+def film(root: Path, outcomes: Sequence[tuple[int, Record]], begun: int = 0, env: Any = None) -> None:
+    """A dataset of so many ticks of each episode, after so many that were not filmed."""
+    from vecenv_eval.datasets.lerobot import LeRobotWriter
+
+    env, writer = env or filmed.FilmedEnv(), LeRobotWriter(root)
+    for _ in range(begun):
+        env.tick(1)
+    for ticks, outcome in outcomes:
+        with watching(env, [writer]):
+            for _ in range(ticks):
+                env.tick(1)
+        writer.finish(1, outcome)
+    writer.close()
+
+
+def frames(root: Path) -> list[dict[str, Any]]:
+    import pyarrow.parquet as pq
+
+    return [row for path in sorted(root.glob("data/*/*.parquet")) for row in pq.read_table(path).to_pylist()]

@@ -49,7 +49,7 @@ def copy_episodes(source: Path, target: Path, episodes: Collection[Episode]) -> 
     writer = _Joiner(target)
     try:
         info = json.loads((source / "meta/info.json").read_text()) if wanted else {}
-        for key, row in _rows(source):
+        for key, row in dict(_rows(source)).items():  # of an episode that ran twice, the last
             if key in wanted:
                 writer.add(source, info, key, row)
     except DatasetError:

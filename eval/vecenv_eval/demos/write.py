@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
@@ -14,7 +13,6 @@ import numpy as np
 
 import vecenv
 from vecenv.libero.tasks.suites import list_suites, list_tasks
-from vecenv_eval.demos.hdf5 import Errors, Opened, member
 from vecenv_eval.demos.schema import Recording
 
 
@@ -29,42 +27,6 @@ def write_demos(path: Path, suite: str, task: int, instruction: str, recordings:
         instruction: its language instruction.
         recordings: episodes of it.
     """
-    with _replaced(path) as data:
-        _describe(data, suite, task, instruction)
-        for recording in recordings:
-            _write_demo(data, recording)
-
-
-def copy_demos(
-    source: Path, target: Path, suite: str, task: int, instruction: str, episodes: Collection[int]
-) -> None:
-    """Copy recordings from one of our files to another, or make that; what is there of these episodes is replaced.
-
-    Args:
-        source, target: the files.
-        suite, task: what is demonstrated.
-        instruction: its language instruction.
-        episodes: which episodes; those without a recording are passed over.
-
-    Raises:
-        DemoError: the source cannot be read.
-    """
-    with Opened(source) as file, Errors(source):
-        from_data = member(file, "data", h5py.Group)
-        names = [name for name in (f"demo_{episode}" for episode in sorted(episodes)) if name in from_data]
-        if not names:
-            return
-        with _replaced(target) as data:
-            _describe(data, suite, task, instruction)
-            for name in names:
-                if name in data:
-                    del data[name]
-                file.copy(member(from_data, name, h5py.Group), data, name=name)
-
-
-@contextmanager
-def _replaced(path: Path) -> Iterator[h5py.Group]:
-    """The group of a file's demonstrations, in a copy that replaces the file at the end."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".tmp")
     if path.exists():
@@ -73,7 +35,9 @@ def _replaced(path: Path) -> Iterator[h5py.Group]:
         temporary.unlink(missing_ok=True)
     with h5py.File(temporary, "a") as file:
         data = file.require_group("data")
-        yield data
+        _describe(data, suite, task, instruction)
+        for recording in recordings:
+            _write_demo(data, recording)
         data.attrs["num_demos"] = len(data)
         data.attrs["total"] = sum(int(group.attrs["num_samples"]) for group in data.values())
     with temporary.open("rb+") as file:

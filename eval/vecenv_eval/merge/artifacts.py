@@ -15,13 +15,12 @@ from vecenv_eval.store import ERRORS, ResultStore
 from vecenv_eval.video.episodes import video_path
 
 
-def copy_artifacts(store: ResultStore, episodes: Mapping[Episode, Source], instructions: Sequence[str]) -> None:
+def copy_artifacts(store: ResultStore, episodes: Mapping[Episode, Source]) -> None:
     """Copy what was recorded of some episodes.
 
     Args:
         store: the merged folder.
         episodes: the folder that each episode is taken from.
-        instructions: instruction of each task.
 
     Raises:
         DemoError, DatasetError: a recording cannot be read.
@@ -30,26 +29,24 @@ def copy_artifacts(store: ResultStore, episodes: Mapping[Episode, Source], instr
     sources = {source.folder: source for source in episodes.values()}
     for source in sources.values():
         own = [key for key, other in episodes.items() if other is source]
-        _copy_demos(store, source.store, own, instructions)
+        _copy_demos(store, source.store, own)
         _copy_videos(store.folder, source.folder, own)
         _copy_dataset(store.folder, source.folder, own)
         if (source.folder / ERRORS).is_file():
             _copy(source.folder / ERRORS, store.folder / f"errors-{source.id[:8]}.log")
 
 
-def _copy_demos(store: ResultStore, source: ResultStore, keys: Sequence[Episode], instructions: Sequence[str]) -> None:
+def _copy_demos(store: ResultStore, source: ResultStore, keys: Sequence[Episode]) -> None:
     by_task: dict[tuple[str, int], list[int]] = {}
     for key in keys:
         if source.demos_path(key.suite, key.task).is_file():
             by_task.setdefault((key.suite, key.task), []).append(key.episode)
     if not by_task:
         return
-    from vecenv_eval.demos.write import copy_demos
+    from vecenv_eval.merge.demos import copy_demos
 
-    for (suite, task), episodes in by_task.items():
-        copy_demos(
-            source.demos_path(suite, task), store.demos_path(suite, task), suite, task, instructions[task], episodes
-        )
+    for key, episodes in by_task.items():
+        copy_demos(source.demos_path(*key), store.demos_path(*key), episodes)
 
 
 def _copy_videos(target: Path, source: Path, keys: Sequence[Episode]) -> None:

@@ -134,7 +134,7 @@ def _merge_one(
             for key, (record, source) in joined.items()
             if source.folder != out and record.replaces(merged.records.get(key)) and not _same(merged, key, record)
         }
-        copy_artifacts(store, new, suite.instructions)
+        copy_artifacts(store, new)
         runs, numbers = _join_runs(merged, sources)
         content = {**merged.content, **_from_any(every), "runs": runs}
         conditions = next((source.conditions for source in every if source.conditions), None)
@@ -168,7 +168,9 @@ def _join(sources: Sequence[Source], planned: Collection[Episode]) -> dict[Episo
                 joined[key] = record, source
             elif not other.error and not record.error and other.verdict != record.verdict:
                 ours, theirs = other.verdict, record.verdict
-                said = ", ".join(f"{name} {ours[name]!r} and {theirs[name]!r}" for name in ours if ours[name] != theirs[name])
+                said = ", ".join(
+                    f"{name} {ours[name]!r} and {theirs[name]!r}" for name in ours if ours[name] != theirs[name]
+                )
                 raise StoreError(
                     f"episode {key.id} has two different verdicts, in {where.folder} and in {source.folder}: {said}"
                 )
