@@ -138,7 +138,7 @@ def test_a_run_that_no_shard_has_begun_is_missing_in_the_merged_campaign(tmp_pat
 
 def test_a_campaign_and_a_single_run_are_not_merged(tmp_path: Path) -> None:
     Campaign(config(), tmp_path / "a", Worlds().simulator).run()
-    with pytest.raises(StoreError, match="holds several suites or seeds, .*libero_goal does not"):
+    with pytest.raises(StoreError, match=r"holds several suites or seeds, .*libero_goal does not"):
         merge(tmp_path / "merged", [tmp_path / "a", tmp_path / "a" / "libero_goal"], simulator=Worlds().simulator)
     Campaign(config(seeds="1,2"), tmp_path / "b", Worlds().simulator).run()
     with pytest.raises(StoreError, match="not from one evaluation: seeds not set and '1,2'"):

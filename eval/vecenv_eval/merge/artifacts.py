@@ -1,6 +1,6 @@
 """What runs recorded beside their rows, copied from the folders that are merged: demonstrations, videos, datasets.
 
-Only what belongs to a row that is taken over is copied. Files are replaced in one step, so a copy is whole or not there.
+Only what belongs to a row that is taken over is copied. Files are replaced in one step: a copy is whole or not there.
 """
 
 from __future__ import annotations

@@ -168,11 +168,10 @@ def _join(sources: Sequence[Source], planned: Collection[Episode]) -> dict[Episo
                 joined[key] = record, source
             elif not other.error and not record.error and other.verdict != record.verdict:
                 ours, theirs = other.verdict, record.verdict
-                said = ", ".join(
-                    f"{name} {ours[name]!r} and {theirs[name]!r}" for name in ours if ours[name] != theirs[name]
-                )
+                different = [name for name in ours if ours[name] != theirs[name]]
                 raise StoreError(
-                    f"episode {key.id} has two different verdicts, in {where.folder} and in {source.folder}: {said}"
+                    f"episode {key.id} has two different verdicts, in {where.folder} and in {source.folder}: "
+                    + ", ".join(f"{name} {ours[name]!r} and {theirs[name]!r}" for name in different)
                 )
     return joined
 

@@ -10,7 +10,10 @@ from pathlib import Path
 
 # File systems of one machine, as Linux names them; every other one, unknown ones included, may be shared.
 LOCAL = frozenset(
-    "ext2 ext3 ext4 xfs btrfs zfs f2fs bcachefs jfs reiserfs nilfs2 tmpfs ramfs overlay vfat exfat ntfs3".split()
+    {
+        *("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "f2fs", "bcachefs", "jfs", "reiserfs", "nilfs2"),
+        *("tmpfs", "ramfs", "overlay", "vfat", "exfat", "ntfs3"),
+    }
 )
 MOUNTS = Path("/proc/self/mounts")
 UNKNOWN = "unknown"

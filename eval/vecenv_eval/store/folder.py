@@ -1,8 +1,8 @@
 """The results folder: one row per episode, written as it ends, so that nothing computed is ever lost.
 
 A folder holds ``config.json`` (what was asked, versions, machine, commit), the rows (``episodes.jsonl`` or
-``episodes.sqlite``, one :class:`Record` an episode, synced to disk), ``errors.log`` (tracebacks of batches that failed),
-and at the end ``summary.json`` and ``report.md``. ``demos/`` holds what was executed, where that was asked for
+``episodes.sqlite``, one :class:`Record` an episode, synced to disk), ``errors.log`` (tracebacks of batches that
+failed), and at the end ``summary.json`` and ``report.md``. ``demos/`` holds what was executed, where that was asked for
 (``vecenv_eval.demos``).
 """
 

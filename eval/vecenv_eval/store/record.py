@@ -83,7 +83,7 @@ class Record:
 
 def to_plain(record: Record) -> dict[str, Any]:
     """A record as JSON has it: no NaN or infinity, which become null."""
-    return _finite(asdict(record))
+    return _finite({**asdict(record), "stand_ins": list(record.stand_ins)})
 
 
 def from_plain(values: Mapping[str, Any]) -> Record:

@@ -85,7 +85,7 @@ class SqliteRows:
 
     def append(self, records: Iterable[Record]) -> None:
         """Add records in one transaction and wait until it is on the disk."""
-        rows = [_columns(record) for record in records]
+        rows = [sqlite_values(to_plain(record)) for record in records]
         with self._errors("written"):
             connection = self._writer()
             with connection:
@@ -126,8 +126,8 @@ class SqliteRows:
         if self.journal == "wal":
             return ""
         return (
-            f"{self.path.name}: SQLite's write-ahead log is off, because file systems of type {self.file_system} may be "
-            "shared over a network; readers may have to wait for the writer."
+            f"{self.path.name}: SQLite's write-ahead log is off, because a file system of type {self.file_system} may "
+            "be shared over a network; readers may have to wait for the writer."
         )
 
     def close(self) -> None:
@@ -209,12 +209,13 @@ class SqliteRows:
             raise StoreError(f"{self.path} cannot be {done}: {error}") from None
 
 
-def _columns(record: Record) -> dict[str, Any]:
-    values = to_plain(record)
-    for name, kind in COLUMNS.items():
-        if kind.startswith("JSON"):
-            values[name] = json.dumps(values[name])
-        elif isinstance(values[name], str):
-            # SQLite stores UTF-8: what has no such form (a surrogate, from a file name of another encoding) is escaped.
-            values[name] = values[name].encode("utf-8", "backslashreplace").decode()
-    return values
+def sqlite_values(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A plain row as SQLite stores it: values without a fixed form as JSON text."""
+    return {name: _stored(value, COLUMNS.get(name, "")) for name, value in row.items()}
+
+
+def _stored(value: Any, kind: str) -> Any:
+    if kind.startswith("JSON"):
+        return json.dumps(value)
+    # SQLite stores UTF-8: what has no such form (a surrogate, from a file name of another encoding) is escaped.
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
