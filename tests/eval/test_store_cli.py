@@ -127,6 +127,14 @@ def test_a_database_without_its_log_is_announced(monkeypatch: pytest.MonkeyPatch
     assert "store sqlite, no write-ahead log (file system nfs4)" in Path("shared/report.md").read_text()
 
 
+def test_a_database_is_reported_like_a_text_file() -> None:
+    for kind in ("jsonl", "sqlite"):
+        assert evaluate("--store", kind, "--out", kind).exit_code == 0
+    tables = [invoke("report", kind, "--format", "csv").stdout for kind in ("jsonl", "sqlite")]
+    assert tables[0] == tables[1].replace("sqlite", "jsonl")
+    assert len(tables[0].splitlines()) > 4
+
+
 def test_shards_are_merged_from_the_command_line() -> None:
     for part in (1, 2):
         assert evaluate("--shard", f"{part}/2", "--out", f"part{part}").exit_code == 0

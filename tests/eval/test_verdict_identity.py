@@ -117,7 +117,7 @@ def test_rows_do_not_depend_on_how_scenes_share_the_slots(tmp_path: Path) -> Non
 
 @dataclass(frozen=True, kw_only=True)
 class Arrangement:
-    """How an evaluation is run: in how many shards, each with its slots, threads, store, refills, and a stop or none."""
+    """How an evaluation is run: in how many shards, with which slots, threads, store and refills, where it stops."""
 
     shards: int
     num_envs: int
