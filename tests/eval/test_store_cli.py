@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -11,7 +12,7 @@ from support.fakes import SUITE, FakeWorld, Worlds
 from typer.testing import CliRunner, Result
 from vecenv_eval import campaign, runner
 from vecenv_eval.merge import folders
-from vecenv_eval.store import ResultStore, sqlite
+from vecenv_eval.store import ResultStore, jsonl, sqlite
 from vecenv_eval.store.lock import writing
 
 from vecenv.cli import build_app
@@ -102,6 +103,26 @@ def test_a_folder_that_another_process_writes_to_is_refused(monkeypatch: pytest.
         os.write(release[1], b"x")
         os.waitpid(child, 0)
     assert evaluate("--out", "here").exit_code == 0
+
+
+def test_a_full_disk_ends_the_run_in_one_sentence_and_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    write, written = jsonl.append_text, []
+
+    def full(path: Path, text: str) -> None:
+        if len(written) == 4:
+            write(path, text[: len(text) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written.append(write(path, text))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jsonl, "append_text", full)
+        assert "error: here/episodes.jsonl cannot be written: No space left" in one_line(
+            evaluate("--out", "here", "--num-envs", "2")
+        )
+    done = ResultStore(Path("here")).done()
+    assert len(done) >= 3
+    assert evaluate("--out", "here").exit_code == 0
+    assert {key for key, record in ResultStore(Path("here")).records().items() if record.run == 0} >= done
 
 
 def test_the_store_is_kept_when_a_folder_is_resumed(world: FakeWorld) -> None:
