@@ -20,7 +20,7 @@ import numpy as np
 
 from vecenv.contract import BatchEnv, Control, Metrics
 from vecenv_eval.clocks import EpisodeClocks
-from vecenv_eval.conditions import conditions
+from vecenv_eval.conditions import conditions, stored_as
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.datasets.lerobot import LeRobotWriter
 from vecenv_eval.drive import drive
@@ -29,7 +29,7 @@ from vecenv_eval.episodes import Episode, Stream, Suite
 from vecenv_eval.policies import Ending, Policy, Refillable, extras_of
 from vecenv_eval.results import Progress, count
 from vecenv_eval.simulator import Simulator
-from vecenv_eval.store import Record, ResultStore
+from vecenv_eval.store import Record, ResultStore, StoreError
 from vecenv_eval.video.episodes import NONE, EpisodeVideos
 from vecenv_eval.watch import watching
 
@@ -133,7 +133,7 @@ class EpisodeLoop:
         try:
             self._progress.report(number, setting_up=True)
             placed = self._environments.place(stream)
-        except ConfigError:
+        except (ConfigError, StoreError):
             raise
         except Exception as error:  # a simulator that cannot place these episodes may place others
             self._write_errors(number, stream.episodes, error)
@@ -143,6 +143,8 @@ class EpisodeLoop:
         try:
             with self._recording(running) as (begin, finish), watching(placed.env, self._watchers):
                 self._run_placed(number, running, begin, finish)
+        except StoreError:
+            raise  # what cannot be stored need not run
         except Exception as error:  # whatever a policy or a simulator raises concerns the running episodes only
             self._write_errors(number, running.slots, error)
             self._environments.close()
@@ -289,7 +291,8 @@ class EpisodeLoop:
         self._progress.count(self._records)
 
     def _write_conditions(self, env: BatchEnv) -> None:
-        self._store.write_config({**self._store.config(), "conditions": conditions(env, self._config)})
+        ran_under = conditions(env, self._config) | stored_as(self._config, self._store.rows.describe())
+        self._store.write_config({**self._store.config(), "conditions": ran_under})
 
 
 class _Running:

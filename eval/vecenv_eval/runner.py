@@ -14,14 +14,13 @@ from pathlib import Path
 from vecenv import family, protocols
 from vecenv.errors import VecenvError
 from vecenv.placement import episode_indices
-from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
+from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy, parse_shard
 from vecenv_eval.environments import make_arguments
-from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
+from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, shard, streams
 from vecenv_eval.loop import EpisodeLoop
 from vecenv_eval.policies import Closing, Refillable, check_policy, make_policy
 from vecenv_eval.provenance import run_conditions
-from vecenv_eval.report import markdown, summarise
-from vecenv_eval.results import EvalResult, Progress, begin
+from vecenv_eval.results import EvalResult, Progress, open_or_begin, write_results
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import RESULTS, ResultStore, default_folder
 
@@ -37,13 +36,13 @@ def evaluate(
 
     Args:
         config: what to evaluate, and how.
-        store: an open results folder, or where to make one; None for ``results/TIME_SUITE_POLICY``.
+        store: an open results folder, or where one is or is to be made; None for ``results/TIME_SUITE_POLICY``.
         on_progress: called after every call of the policy.
         simulator: where environments come from, ``vecenv`` when not given.
 
     Raises:
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
-        StoreError: the folder cannot be made.
+        StoreError: the folder cannot be made, or holds another evaluation.
     """
     try:
         evaluation = Evaluation(config, simulator)
@@ -52,7 +51,7 @@ def evaluate(
             store.discard()  # a folder without episodes
         raise
     if not isinstance(store, ResultStore):
-        store = begin(config, store or default_folder(RESULTS, config.suite, config.policy_name))
+        store = open_or_begin(config, store or default_folder(RESULTS, config.suite, config.policy_name))
     return evaluation.run(store, on_progress)
 
 
@@ -92,9 +91,21 @@ class Evaluation:
 
         Raises:
             ConfigError: the environment refuses a setting; a results folder without episodes is removed.
+            StoreError: another process writes to the results folder, or it cannot be written.
         """
+        try:
+            with store.writing():
+                return self._run(store, on_progress)
+        finally:
+            store.close()
+            if isinstance(self.policy, Closing):
+                self.policy.close()
+
+    def _run(self, store: ResultStore, on_progress: Callable[[Progress], None]) -> EvalResult:
         content = store.config()
-        store.write_config({**content, "runs": [*content["runs"], run_conditions()]})
+        store.write_config(
+            {**content, "policy_name": self.policy.name, "runs": [*content.get("runs", []), run_conditions()]}
+        )
         loop = EpisodeLoop(
             self.config,
             self.suite,
@@ -103,41 +114,20 @@ class Evaluation:
             store,
             planned=self.planned,
             on_progress=on_progress,
-            index=len(content["runs"]),
+            index=len(content.get("runs", [])),
         )
         try:
             interrupted = loop.run(self.streams(store.done()), self._again)
         except ConfigError:
             store.discard()
             raise
-        finally:
-            if isinstance(self.policy, Closing):
-                self.policy.close()
-        return self._summarise(store, interrupted, tuple(loop.causes))
+        return write_results(
+            store, self.suite, self.planned, self.policy.name, interrupted=interrupted, causes=tuple(loop.causes)
+        )
 
     def _again(self, episodes: Collection[Episode]) -> list[Stream]:
         """Streams of these episodes alone."""
         return self.streams(done=frozenset(self.planned) - frozenset(episodes))
-
-    def _summarise(self, store: ResultStore, interrupted: bool, causes: tuple[str, ...]) -> EvalResult:
-        """Write the summary of all records in the folder, and return it with them."""
-        records, planned = store.records(), self.planned
-        summary = summarise(
-            records.values(),
-            planned,
-            suite=self.suite.name,
-            policy=self.policy.name,
-            instructions=self.suite.instructions,
-            conditions=store.config().get("conditions", {}),
-        )
-        store.write_summary(summary.to_dict(), markdown(summary))
-        return EvalResult(
-            summary=summary,
-            records=tuple(records[key] for key in planned if key in records),
-            folder=store.folder,
-            interrupted=interrupted,
-            causes=causes,
-        )
 
 
 def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, ...], dict[int, tuple[int, ...]]]:
@@ -147,7 +137,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
     """
     suite = simulator.suite(config.suite, config.protocol)
-    tasks, episodes = _chosen_episodes(config, suite)
+    tasks, episodes = chosen_episodes(config, suite)
     _check_make(simulator, config)
     _check_record(config)
     _check_policy(config)
@@ -162,15 +152,21 @@ def _policy_seed(config: EvalConfig) -> int:
     return protocols.protocol(config.protocol, family(config.suite)).seed or 0
 
 
-def _chosen_episodes(config: EvalConfig, suite: Suite) -> tuple[tuple[int, ...], dict[int, tuple[int, ...]]]:
-    """The tasks, and which episodes of each."""
+def chosen_episodes(config: EvalConfig, suite: Suite) -> tuple[tuple[int, ...], dict[int, tuple[int, ...]]]:
+    """The tasks to run, and which episodes of each; of a shard, its own.
+
+    Raises:
+        ConfigError, SpecError: there are no such tasks or episodes.
+    """
     tasks = parse_tasks(config.tasks, len(suite.instructions), suite.tasks)
     if config.tasks.strip() == ALL:
         tasks = tuple(task for task in tasks if suite.episodes_of(task))
     missing = [task for task in tasks if not suite.episodes_of(task)]
     if missing:
         raise ConfigError(f"protocol {config.protocol!r} has no episodes of task {missing[0]} of {suite.name}")
-    return tasks, {task: episode_indices(config.episodes, suite.episodes_of(task), suite.every) for task in tasks}
+    episodes = {task: episode_indices(config.episodes, suite.episodes_of(task), suite.every) for task in tasks}
+    own = shard(suite, tasks, episodes, *parse_shard(config.shard))
+    return tuple(own), own
 
 
 def _check_make(simulator: Simulator, config: EvalConfig) -> None:
