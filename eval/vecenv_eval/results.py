@@ -89,7 +89,10 @@ def resume(folder: Path, **changes: Any) -> tuple[EvalConfig, ResultStore]:
         config = EvalConfig.from_dict(store.config()["config"])
     except (KeyError, TypeError, AttributeError, ConfigError) as error:
         raise StoreError(f"{folder / CONFIG} does not hold an evaluation: {error}") from None
-    return replace(config, **{key: value for key, value in changes.items() if value is not None}), store
+    given = {key: value for key, value in changes.items() if value is not None}
+    if given.get("engine", config.engine) != config.engine:  # another engine takes other arguments
+        given.setdefault("engine_args", {})
+    return replace(config, **given), store
 
 
 def count(records: Iterable[Record]) -> dict[str, int]:
