@@ -1,7 +1,7 @@
 """Evaluate a policy on a suite: check the config, run what has no verdict yet, summarise.
 
 An :class:`~vecenv_eval.config.EvalConfig` and a results folder come in; :class:`Evaluation` refuses what cannot run
-before anything is built, plans the batches, has an engine run them (``vecenv_eval.engines``) and returns an
+before anything is built, plans the batches, has an engine run them (``vecenv_eval.engine``) and returns an
 :class:`~vecenv_eval.results.EvalResult`.
 """
 
@@ -16,7 +16,7 @@ from vecenv import family, protocols
 from vecenv.errors import VecenvError
 from vecenv.placement import episode_indices
 from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
-from vecenv_eval.engines import Outcome, make_engine
+from vecenv_eval.engine import EngineError, Outcome, make_engine
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks
 from vecenv_eval.loop import make_streams
@@ -114,7 +114,7 @@ class Evaluation:
         store.write_config({**content, "runs": [*runs, {**run_conditions(), "engine": self.config.engine}]})
         try:
             outcome = self._engine.run(self, store, len(runs), on_progress)
-        except ConfigError:
+        except (ConfigError, EngineError):
             store.discard()
             raise
         return self._summarise(store, outcome)

@@ -144,7 +144,7 @@ def _run_campaign(campaign: Campaign, quiet: bool) -> int:
 @contextmanager
 def _user_errors() -> Iterator[None]:
     """A mistake of the user becomes one line and exit status 2, and so does a cluster that cannot be used."""
-    from vecenv_eval.engines import EngineError
+    from vecenv_eval.engine import EngineError
     from vecenv_eval.episodes import SpecError
     from vecenv_eval.policies import PolicyError
     from vecenv_eval.store import StoreError

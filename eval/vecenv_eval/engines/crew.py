@@ -6,11 +6,13 @@ seat outlives its actors: when one is lost, the seat gets another as soon as the
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, cast
 
 import ray
+from ray.cloudpickle import cloudpickle
 from ray.exceptions import RayError
 
 from vecenv_eval.engines.ray_actor import ActorInfo, Assignment, EpisodeActor, Report
@@ -60,12 +62,12 @@ class Seat:
         """Its actor is ready and has nothing to do."""
         return self.info is not None and self.waits_for is None
 
-    def start(self, assignment: Assignment, resources: Mapping[str, float]) -> None:
+    def start(self, assignment: bytes, resources: Mapping[str, float]) -> None:
         """Ask Ray for an actor; it begins once a node has room for it."""
         kind: Any = ray.remote(EpisodeActor)
         self._actor = kind.options(
             num_cpus=resources["CPU"], num_gpus=resources["GPU"], max_restarts=0, max_concurrency=2
-        ).remote(assignment)
+        ).remote(assignment, sys.path)
         self.info, self.waits_for = None, self._actor.prepare.remote()
 
     def give(self, number: int, episodes: Sequence[Episode], scene: Hashable) -> None:
@@ -113,10 +115,10 @@ class Crew:
     """
 
     def __init__(self, size: int, assignment: Assignment, resources: Mapping[str, float]) -> None:
-        self._assignment, self._resources = assignment, resources
+        self._assignment, self._resources = cloudpickle.dumps(assignment), resources
         self.seats = [Seat() for _ in range(size)]
         for seat in self.seats:
-            seat.start(assignment, resources)
+            seat.start(self._assignment, resources)
 
     @property
     def active(self) -> list[Seat]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, ClassVar
 
 from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.engines import Outcome
+from vecenv_eval.engine import Outcome
 from vecenv_eval.episodes import Episode, Stream
 from vecenv_eval.loop import EpisodeLoop
 from vecenv_eval.policies import Closing
@@ -30,7 +30,7 @@ class LocalEngine:
     def run(
         self, evaluation: Evaluation, store: ResultStore, index: int, on_progress: Callable[[Progress], None]
     ) -> Outcome:
-        """Run what has no verdict; see :class:`vecenv_eval.engines.Engine`."""
+        """Run what has no verdict; see :class:`vecenv_eval.engine.Engine`."""
         policy, planned = evaluation.policy, frozenset(evaluation.planned)
         loop = EpisodeLoop(
             evaluation.config,

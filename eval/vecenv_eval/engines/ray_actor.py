@@ -7,6 +7,7 @@ files, so it may be on a machine that does not share the folder.
 
 from __future__ import annotations
 
+import pickle
 import queue
 import socket
 import sys
@@ -45,7 +46,6 @@ class Assignment:
         simulator: builds environments.
         policy_seed: seed of the policy.
         index: number of this run on the results folder.
-        path: folders in which the driver finds modules.
     """
 
     config: EvalConfig
@@ -53,7 +53,6 @@ class Assignment:
     simulator: Simulator
     policy_seed: int
     index: int
-    path: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,10 +148,15 @@ class Outbox:
 
 
 class EpisodeActor:
-    """Runs units of episodes, in one thread from the first to the last: GL contexts belong to a thread."""
+    """Runs units of episodes, in one thread from the first to the last: GL contexts belong to a thread.
 
-    def __init__(self, assignment: Assignment) -> None:
-        self._assignment = assignment
+    Args:
+        assignment: an :class:`Assignment`, pickled: what it names is imported in :meth:`prepare`.
+        path: folders in which the driver finds modules.
+    """
+
+    def __init__(self, assignment: bytes, path: Sequence[str]) -> None:
+        self._pickled, self._path = assignment, path
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="episodes")
         self._scratch = tempfile.TemporaryDirectory(prefix="vecenv-actor-")
         self._outbox = Outbox(Path(self._scratch.name))
@@ -162,11 +166,7 @@ class EpisodeActor:
         self._loop: EpisodeLoop | None = None
 
     def prepare(self) -> ActorInfo:
-        """Make the policy.
-
-        Raises:
-            PolicyError: it cannot be made on this machine.
-        """
+        """Make the policy. Whatever is raised says that this machine lacks something that the driver's has."""
         return self._thread.submit(self._prepare).result()
 
     def run(self, number: int, episodes: Sequence[Episode]) -> Iterator[Report]:
@@ -189,8 +189,9 @@ class EpisodeActor:
         self._scratch.cleanup()
 
     def _prepare(self) -> ActorInfo:
-        given = self._assignment
-        sys.path += [folder for folder in given.path if folder not in sys.path]
+        sys.path += [folder for folder in self._path if folder not in sys.path]
+        self._given: Assignment = pickle.loads(self._pickled)
+        given = self._given
         policy = make_policy(given.config.policy_name, seed=given.policy_seed, **given.config.policy_args)
         self._policy = policy
         self._loop = EpisodeLoop(
@@ -211,7 +212,7 @@ class EpisodeActor:
         by_task: dict[int, list[int]] = {}
         for episode in episodes:
             by_task.setdefault(episode.task, []).append(episode.episode)
-        suite, most = self._assignment.suite, self._assignment.config.num_envs
+        suite, most = self._given.suite, self._given.config.num_envs
         try:
             for stream in make_streams(self._policy, suite, list(by_task), by_task, num_envs=most):
                 self._loop.run_stream(number, stream)

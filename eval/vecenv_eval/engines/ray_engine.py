@@ -9,7 +9,7 @@ Episodes whose actor was lost run again; if both attempts reported a verdict, th
 from __future__ import annotations
 
 import os
-import sys
+import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -23,7 +23,7 @@ from ray.exceptions import RayError, RayTaskError
 import vecenv
 from vecenv.util.cores import usable_cores
 from vecenv_eval.config import ConfigError, EvalConfig, from_values
-from vecenv_eval.engines import EngineError, Outcome
+from vecenv_eval.engine import EngineError, Outcome
 from vecenv_eval.engines.crew import Crew, Seat
 from vecenv_eval.engines.ledger import Ledger
 from vecenv_eval.engines.ray_actor import ActorInfo, Assignment, Report
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 # Seconds after which a driver looks around although nothing has arrived.
 _LOOK_S = 1.0
+# Seconds in which a cluster has to answer.
+_CONNECT_S = 10.0
 # Seconds for reports that are on their way when a run is interrupted.
 _LAST_REPORTS_S = 2.0
 
@@ -64,7 +66,7 @@ class RayEngine:
     def run(
         self, evaluation: Evaluation, store: ResultStore, index: int, on_progress: Callable[[Progress], None]
     ) -> Outcome:
-        """Run what has no verdict; see :class:`vecenv_eval.engines.Engine`."""
+        """Run what has no verdict; see :class:`vecenv_eval.engine.Engine`."""
         ledger = Ledger(store, evaluation.planned, evaluation.suite.instructions)
         if not ledger.missing:
             return Outcome(interrupted=False, causes=(), policy=ledger.policy or evaluation.config.policy_name)
@@ -288,8 +290,18 @@ def _assignment(evaluation: Evaluation, wanted: dict[str, float], index: int) ->
         simulator=evaluation.simulator,
         policy_seed=evaluation.policy_seed,
         index=index,
-        path=tuple(sys.path),
     )
+
+
+def _check_address(address: str | None) -> None:
+    """Raise at once where nothing answers at an address: Ray itself would try for minutes."""
+    host, colon, port = (address or "").rpartition(":")
+    if not colon:
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise EngineError(f"no Ray cluster at {address}: {error}") from None
 
 
 @contextmanager
@@ -304,6 +316,7 @@ def _connected(options: RayOptions, wanted: dict[str, float]) -> Iterator[None]:
             raise EngineError("this process is connected to Ray already: leave out address and runtime_env")
         yield
         return
+    _check_address(options.address)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "runtime_env": options.runtime_env}
     if options.address is None:

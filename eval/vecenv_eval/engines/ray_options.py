@@ -51,6 +51,11 @@ class RayOptions:
                 raise ConfigError(f"engine argument {name} must be at least {minimum}, not {value}")
         if self.start_timeout_s <= 0:
             raise ConfigError(f"engine argument start_timeout_s must be above 0, not {self.start_timeout_s}")
+        if (self.address or "").startswith("ray://"):
+            raise ConfigError(
+                f"engine argument address={self.address}: the Ray client cannot stream records; run on a node of "
+                "the cluster, with address=auto or address=HOST:PORT"
+            )
         if self.gpus is not None and self.gpus > 1 and self.gpus != int(self.gpus):
             raise ConfigError(f"engine argument gpus must be a whole number or below 1, not {self.gpus}")
 
