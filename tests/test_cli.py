@@ -162,7 +162,8 @@ def test_eval_ends_in_a_table_and_a_results_folder(world: FakeWorld) -> None:
     assert "50.0%" in result.stdout
     folder = Path(result.stdout.splitlines()[-1])
     assert folder.parent == Path("results")
-    assert sorted(p.name for p in folder.iterdir()) == ["config.json", "episodes.jsonl", "report.md", "summary.json"]
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    assert names == ["config.json", "episodes.jsonl", "report.md", "summary.json"]
     assert len((folder / "episodes.jsonl").read_text().splitlines()) == 4
 
 

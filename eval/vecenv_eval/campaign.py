@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.results import EvalResult, Progress, begin, resume
+from vecenv_eval.results import EvalResult, Progress, open_or_begin, refuse_other_settings
 from vecenv_eval.runner import Evaluation, check
 from vecenv_eval.simulator import Simulator, vecenv_simulator
-from vecenv_eval.store import CONFIG, REPORT, SUMMARY, StoreError
+from vecenv_eval.store import REPORT, SUMMARY, ResultStore, StoreError
+from vecenv_eval.store.files import replace_text
 
 CAMPAIGN = "campaign.json"
 
@@ -111,15 +112,18 @@ class Campaign:
         config: what to evaluate.
         folder: the results folder of the whole.
         simulator: where environments come from, ``vecenv`` when not given.
+        checked: check the settings; not needed where nothing is to be run.
 
     Raises:
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
     """
 
-    def __init__(self, config: EvalConfig, folder: Path, simulator: Simulator | None = None) -> None:
+    def __init__(
+        self, config: EvalConfig, folder: Path, simulator: Simulator | None = None, *, checked: bool = True
+    ) -> None:
         self.config, self.folder, self._simulator = config, folder, simulator
         self.legs = legs(config, folder)
-        for leg in self.legs:
+        for leg in self.legs if checked else ():
             check(leg.config, simulator or vecenv_simulator())
 
     @classmethod
@@ -129,49 +133,70 @@ class Campaign:
         Raises:
             StoreError: the folder holds none.
         """
-        try:
-            config = EvalConfig.from_dict(json.loads((folder / CAMPAIGN).read_text()))
-        except (OSError, ValueError) as error:
-            raise StoreError(f"{folder / CAMPAIGN} cannot be read: {error}") from None
-        return cls(config, folder, simulator)
+        return cls(read_campaign(folder), folder, simulator)
 
     def run(
         self,
         on_progress: Callable[[Leg, Progress], None] = lambda leg, progress: None,
         on_result: Callable[[Leg, EvalResult], None] = lambda leg, result: None,
+        on_begin: Callable[[Leg, ResultStore], None] = lambda leg, store: None,
     ) -> tuple[CampaignSummary, list[EvalResult]]:
         """Run what has no verdict yet, run by run; Ctrl-C ends it with what was computed.
 
         Raises:
-            StoreError: something is in the way.
+            StoreError: something is in the way, or the folder holds a campaign with other settings.
         """
-        if not (self.folder / CAMPAIGN).exists():
-            if self.folder.exists() and any(self.folder.iterdir()):
-                raise StoreError(f"{self.folder} is already there and not empty: name another, or use --resume")
-            self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / CAMPAIGN).write_text(json.dumps(self.config.to_dict(), indent=2) + "\n")
+        write_campaign(self.config, self.folder)
         results: list[EvalResult] = []
         summary = summarise((), ())
         for leg in self.legs:
-            begun = (leg.folder / CONFIG).exists()
-            config, store = resume(leg.folder) if begun else (leg.config, begin(leg.config, leg.folder))
+            store = open_or_begin(leg.config, leg.folder)
+            on_begin(leg, store)
 
             def report(progress: Progress, leg: Leg = leg) -> None:
                 on_progress(leg, progress)
 
-            result = Evaluation(config, self._simulator).run(store, report)
+            result = Evaluation(leg.config, self._simulator).run(store, report)
             results.append(result)
             on_result(leg, result)
-            summary = self._write(results)
+            summary = self.write_summary(results)
             if result.interrupted:
                 break
         return summary, results
 
-    def _write(self, results: Sequence[EvalResult]) -> CampaignSummary:
+    def write_summary(self, results: Sequence[EvalResult]) -> CampaignSummary:
+        """Write ``summary.json`` and ``report.md`` of the first runs, and return their numbers."""
         summary = summarise(self.legs[: len(results)], results)
-        (self.folder / SUMMARY).write_text(json.dumps(asdict(summary), indent=2) + "\n")
-        (self.folder / REPORT).write_text(markdown(summary))
+        replace_text(self.folder / SUMMARY, json.dumps(asdict(summary), indent=2) + "\n")
+        replace_text(self.folder / REPORT, markdown(summary))
         return summary
+
+
+def read_campaign(folder: Path) -> EvalConfig:
+    """The config of a campaign's folder.
+
+    Raises:
+        StoreError: the folder holds none.
+    """
+    try:
+        return EvalConfig.from_dict(json.loads((folder / CAMPAIGN).read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise StoreError(f"{folder / CAMPAIGN} cannot be read: {error}") from None
+
+
+def write_campaign(config: EvalConfig, folder: Path) -> None:
+    """Make the folder of a campaign, unless it is there.
+
+    Raises:
+        StoreError: there is something else, or a campaign with other settings.
+    """
+    if (folder / CAMPAIGN).exists():
+        refuse_other_settings(config, read_campaign(folder), folder)
+        return
+    if folder.exists() and (not folder.is_dir() or any(path.name != f"{CAMPAIGN}.tmp" for path in folder.iterdir())):
+        raise StoreError(f"{folder} is already there and not empty: name another, or use --resume")
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_text(folder / CAMPAIGN, json.dumps(config.to_dict(), indent=2) + "\n")
 
 
 def summarise(run: Sequence[Leg], results: Sequence[EvalResult]) -> CampaignSummary:

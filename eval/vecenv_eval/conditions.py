@@ -11,6 +11,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from vecenv import family, protocols
+from vecenv_eval.config import STORE_CHOICES
 
 if TYPE_CHECKING:
     from vecenv.contract import BatchEnv
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 # Stands for a choice that a family of suites does not have.
 NONE = "-"
+# Conditions that no verdict depends on.
+INDIFFERENT = ("shard", "store")
 
 
 def conditions(env: BatchEnv, config: EvalConfig) -> dict[str, Any]:
@@ -54,6 +57,17 @@ def conditions(env: BatchEnv, config: EvalConfig) -> dict[str, Any]:
     }
 
 
+def stored_as(config: EvalConfig, store: str) -> dict[str, Any]:
+    """Conditions that no verdict depends on: which shard of the episodes this is, and how a database is kept.
+
+    Args:
+        config: what was asked for.
+        store: ``Rows.describe()``.
+    """
+    shard = {} if config.shard is None else {"shard": config.shard}
+    return shard if config.store == STORE_CHOICES[0] else {**shard, "store": store}
+
+
 def _simpler(env: BatchEnv, chosen: protocols.Protocol, used: Mapping[str, Any]) -> dict[str, Any]:
     most = _of(env, "max_steps")
     return {
@@ -82,6 +96,7 @@ def describe(conditions: Mapping[str, Any]) -> str:
         "fixtures": conditions["fixtures"],
         "seed": conditions["seed"],
     }
+    parts |= {name: conditions[name] for name in INDIFFERENT if name in conditions}
     return "; ".join(f"{name} {value}" for name, value in parts.items()) + "."
 
 

@@ -8,7 +8,9 @@ module imports neither NumPy nor a simulator, because ``vecenv --help`` reads it
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import Field, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 ALL = "all"
 VIDEO_CHOICES = ("none", "failures", "all")
+STORE_CHOICES = ("jsonl", "sqlite")
 # Policies that know a benchmark's scenes, by the family of suites they are made for.
 SCRIPTED = {"libero": "pick_place", "simpler": "simpler_scripted"}
 _KEY = "setting"
@@ -43,6 +46,7 @@ class Setting:
         minimum: the smallest number allowed.
         flag: its option on the command line without ``--``, where that is not the field's name.
         resumable: it may change when a results folder is resumed, because no verdict depends on it.
+        decides: two results folders with other values of it are about other evaluations; never so if ``resumable``.
     """
 
     help: str
@@ -50,6 +54,7 @@ class Setting:
     minimum: int | None = None
     flag: str = ""
     resumable: bool = False
+    decides: bool = True
 
 
 def setting(field: Field[Any]) -> Setting:
@@ -63,9 +68,15 @@ def option_name(field: Field[Any]) -> str:
 
 
 def _about(
-    help: str, *, default: str = "", minimum: int | None = None, flag: str = "", resumable: bool = False
+    help: str,
+    *,
+    default: str = "",
+    minimum: int | None = None,
+    flag: str = "",
+    resumable: bool = False,
+    decides: bool = True,
 ) -> dict[str, Setting]:
-    return {_KEY: Setting(help, default, minimum, flag, resumable)}
+    return {_KEY: Setting(help, default, minimum, flag, resumable, decides and not resumable)}
 
 
 def default_policy(suite: str) -> str:
@@ -152,6 +163,16 @@ class EvalConfig:
     record_lerobot: bool = field(
         default=False, metadata=_about("Write the run as a LeRobot dataset into DIR/lerobot.", resumable=True)
     )
+    store: str = field(
+        default="jsonl",
+        metadata=_about("Where rows are kept: jsonl (a text file) or sqlite (a database).", decides=False),
+    )
+    shard: str | None = field(
+        default=None,
+        metadata=_about(
+            "Run part i of n of the episodes: i/n; `vecenv merge` joins the parts.", default="all", decides=False
+        ),
+    )
     fail_fast: bool = field(default=False, metadata=_about("Stop at the first batch that raises.", resumable=True))
     engine: str = field(
         default="local",
@@ -165,6 +186,9 @@ class EvalConfig:
     def __post_init__(self) -> None:
         if self.video not in VIDEO_CHOICES:
             raise ConfigError(f"video={self.video!r}: expected one of {', '.join(VIDEO_CHOICES)}")
+        if self.store not in STORE_CHOICES:
+            raise ConfigError(f"store={self.store!r}: expected one of {', '.join(STORE_CHOICES)}")
+        parse_shard(self.shard)
         for each in fields(self):
             value, minimum = getattr(self, each.name), setting(each).minimum
             if minimum is not None and value is not None and value < minimum:
@@ -255,6 +279,37 @@ def from_values(cls: type[_Settings], values: Mapping[str, Any], what: str) -> _
         return TypeAdapter(cls).validate_python(dict(values))
     except ValidationError as error:
         raise ConfigError("; ".join(map(_problem, error.errors()))) from None
+
+
+def parse_shard(text: str | None) -> tuple[int, int]:
+    """Read ``"2/5"`` as (2, 5): the second of five parts; None is the whole, (1, 1).
+
+    Raises:
+        ConfigError: it is not of this form, or there is no such part.
+    """
+    if text is None:
+        return 1, 1
+    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip())
+    part, parts = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not 1 <= part <= parts:
+        raise ConfigError(f"shard={text!r}: expected i/n with 1 <= i <= n, such as 2/5")
+    return part, parts
+
+
+def differences(first: EvalConfig, second: EvalConfig, *, but: Collection[str] = ()) -> list[str]:
+    """Where two configs are about other evaluations: ``"max_steps 20 and 10"``, one text a setting.
+
+    Args:
+        first, second: the configs.
+        but: settings to leave out.
+    """
+    one, two = (json.loads(json.dumps(config.to_dict(), default=str)) for config in (first, second))
+    decisive = [each.name for each in fields(EvalConfig) if setting(each).decides and each.name not in but]
+    return [f"{name} {_text(one[name])} and {_text(two[name])}" for name in decisive if one[name] != two[name]]
+
+
+def _text(value: object) -> str:
+    return "not set" if value is None else f"{value!r:.100}"
 
 
 def _problem(error: ErrorDetails) -> str:

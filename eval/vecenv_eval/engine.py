@@ -41,19 +41,17 @@ class Outcome:
     Attributes:
         interrupted: it was stopped from the keyboard.
         causes: what failed, one line each, without repetition.
-        policy: name of the policy.
     """
 
     interrupted: bool
     causes: tuple[str, ...]
-    policy: str
 
 
 class Engine(Protocol):
     """Runs episodes somewhere. Its constructor takes the config, and refuses arguments with a ``ConfigError``.
 
     Attributes:
-        in_process: the policy is made in this process.
+        in_process: the policy is made in this process. Otherwise the engine writes its name to the results folder.
     """
 
     in_process: ClassVar[bool]

@@ -24,6 +24,7 @@ __all__ = [
     "parse_episodes",
     "parse_tasks",
     "plan",
+    "shard",
     "streams",
 ]
 
@@ -131,6 +132,28 @@ def plan(
         if missing:
             batches += _rectangles(suite.name, [t for t, _ in group], missing, num_envs)
     return batches
+
+
+def shard(
+    suite: Suite, tasks: Sequence[int], episodes: Mapping[int, Sequence[int]], part: int, parts: int
+) -> dict[int, tuple[int, ...]]:
+    """Part ``part`` of ``parts`` of an evaluation's episodes, by task; tasks without any are left out.
+
+    The parts are disjoint, together they are the whole, and their sizes differ by one episode at most. The episodes of
+    a scene stay together: there are at most ``parts - 1`` scenes of which more than one part has episodes.
+
+    Args:
+        suite: the suite, for which tasks share a scene.
+        tasks: task indices.
+        episodes: episode indices by task.
+        part, parts: which part, 1 <= part <= parts.
+    """
+    whole = [(task, episode) for task in _by_scene(suite, tasks) for episode in episodes[task]]
+    start, stop = len(whole) * (part - 1) // parts, len(whole) * part // parts
+    chosen: dict[int, tuple[int, ...]] = {}
+    for task, episode in whole[start:stop]:
+        chosen[task] = (*chosen.get(task, ()), episode)
+    return {task: chosen[task] for task in tasks if task in chosen}
 
 
 def _by_scene(suite: Suite, tasks: Sequence[int]) -> list[int]:

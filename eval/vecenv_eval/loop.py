@@ -30,7 +30,7 @@ from vecenv_eval.policies import Ending, Policy, Refillable, extras_of
 from vecenv_eval.results import Progress, count
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.sink import Sink
-from vecenv_eval.store import Record
+from vecenv_eval.store import Record, StoreError
 from vecenv_eval.video.episodes import NONE, EpisodeVideos
 from vecenv_eval.watch import watching
 
@@ -181,7 +181,7 @@ class EpisodeLoop:
         try:
             self._progress.report(number, setting_up=True)
             placed = self._environments.place(stream)
-        except ConfigError:
+        except (ConfigError, StoreError):
             raise
         except Exception as error:  # a simulator that cannot place these episodes may place others
             self._write_errors(number, stream.episodes, error)
@@ -191,6 +191,8 @@ class EpisodeLoop:
         try:
             with self._recording(running) as (begin, finish), watching(placed.env, self._watchers):
                 self._run_placed(number, running, begin, finish)
+        except StoreError:
+            raise  # what cannot be stored need not run
         except Exception as error:  # whatever a policy or a simulator raises concerns the running episodes only
             self._write_errors(number, running.slots, error)
             self._environments.close()

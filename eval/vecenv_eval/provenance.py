@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,15 @@ def run_conditions() -> dict[str, Any]:
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "arguments": sys.argv[1:],
         "commit": git_commit(),
-        "versions": doctor.versions(),
+        "versions": dict(_versions()),
         "machine": doctor.machine(),
     }
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """The versions, which take half a second to look up and stay what they are."""
+    return doctor.versions()
 
 
 def git_commit() -> str:

@@ -5,14 +5,18 @@ Records come in as episodes end; :class:`Progress` goes to whoever watches, :cla
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.report import Summary
+from vecenv_eval.config import ConfigError, EvalConfig, differences
+from vecenv_eval.episodes import Episode, Suite
+from vecenv_eval.report import Summary, markdown, summarise
 from vecenv_eval.store import CONFIG, Record, ResultStore, StoreError
+
+# Where ``config.json`` has the policy's name, which is known where the policy is made.
+POLICY_NAME = "policy_name"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +78,38 @@ def begin(config: EvalConfig, folder: Path) -> ResultStore:
     return ResultStore.create(folder, {"config": config.to_dict(), "runs": []})
 
 
+def open_or_begin(config: EvalConfig, folder: Path) -> ResultStore:
+    """The results folder of a config: continued if it is there, so that a command can simply be repeated, else new.
+
+    Raises:
+        StoreError: there is something else, or an evaluation with other settings; the message names them.
+    """
+    if not (folder / CONFIG).is_file():
+        return begin(config, folder)
+    there, store = resume(folder)
+    refuse_other_settings(config, there, folder)
+    return store
+
+
+def refuse_other_settings(config: EvalConfig, there: EvalConfig, folder: Path) -> None:
+    """Refuse to continue a folder with settings that it was not begun with.
+
+    Raises:
+        StoreError: with the settings that differ.
+    """
+    other = differences(there, config)
+    other += [
+        f"{name} {getattr(there, name)!r} and {getattr(config, name)!r}"
+        for name in ("store", "shard")
+        if getattr(there, name) != getattr(config, name)
+    ]
+    if other:
+        raise StoreError(
+            f"{folder} is already there and holds another evaluation (there and here: {', '.join(other)}): "
+            "name another folder"
+        )
+
+
 def resume(folder: Path, **changes: Any) -> tuple[EvalConfig, ResultStore]:
     """Open an existing results folder, to run what is missing.
 
@@ -93,6 +129,43 @@ def resume(folder: Path, **changes: Any) -> tuple[EvalConfig, ResultStore]:
     if given.get("engine", config.engine) != config.engine:  # another engine takes other arguments
         given.setdefault("engine_args", {})
     return replace(config, **given), store
+
+
+def write_results(
+    store: ResultStore,
+    suite: Suite,
+    planned: Sequence[Episode],
+    policy: str,
+    *,
+    interrupted: bool = False,
+    causes: Sequence[str] = (),
+) -> EvalResult:
+    """Write ``summary.json`` and ``report.md`` of all records in a folder, and return both.
+
+    Args:
+        store: the results folder.
+        suite: the suite.
+        planned: every episode of the evaluation.
+        policy: name of the policy.
+        interrupted, causes: see `EvalResult`.
+    """
+    records = store.records()
+    summary = summarise(
+        records.values(),
+        planned,
+        suite=suite.name,
+        policy=policy,
+        instructions=suite.instructions,
+        conditions=store.config().get("conditions", {}),
+    )
+    store.write_summary(summary.to_dict(), markdown(summary))
+    return EvalResult(
+        summary=summary,
+        records=tuple(records[key] for key in planned if key in records),
+        folder=store.folder,
+        interrupted=interrupted,
+        causes=tuple(causes),
+    )
 
 
 def count(records: Iterable[Record]) -> dict[str, int]:

@@ -15,15 +15,14 @@ from pathlib import Path
 from vecenv import family, protocols
 from vecenv.errors import VecenvError
 from vecenv.placement import episode_indices
-from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
-from vecenv_eval.engine import EngineError, Outcome, make_engine
+from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy, parse_shard
+from vecenv_eval.engine import EngineError, make_engine
 from vecenv_eval.environments import make_arguments
-from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks
+from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, shard
 from vecenv_eval.loop import make_streams
-from vecenv_eval.policies import Policy, check_policy, make_policy
+from vecenv_eval.policies import Closing, Policy, check_policy, make_policy
 from vecenv_eval.provenance import run_conditions
-from vecenv_eval.report import markdown, summarise
-from vecenv_eval.results import EvalResult, Progress, begin
+from vecenv_eval.results import POLICY_NAME, EvalResult, Progress, open_or_begin, write_results
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import RESULTS, ResultStore, default_folder
 
@@ -39,13 +38,13 @@ def evaluate(
 
     Args:
         config: what to evaluate, and how.
-        store: an open results folder, or where to make one; None for ``results/TIME_SUITE_POLICY``.
+        store: an open results folder, or where one is or is to be made; None for ``results/TIME_SUITE_POLICY``.
         on_progress: called after every call of the policy.
         simulator: where environments come from, ``vecenv`` when not given.
 
     Raises:
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
-        StoreError: the folder cannot be made.
+        StoreError: the folder cannot be made, or holds another evaluation.
     """
     try:
         evaluation = Evaluation(config, simulator)
@@ -54,7 +53,7 @@ def evaluate(
             store.discard()  # a folder without episodes
         raise
     if not isinstance(store, ResultStore):
-        store = begin(config, store or default_folder(RESULTS, config.suite, config.policy_name))
+        store = open_or_begin(config, store or default_folder(RESULTS, config.suite, config.policy_name))
     return evaluation.run(store, on_progress)
 
 
@@ -108,35 +107,29 @@ class Evaluation:
         Raises:
             ConfigError: the environment refuses a setting; a results folder without episodes is removed.
             EngineError: the engine cannot run anything.
+            StoreError: another process writes to the results folder, or it cannot be written.
         """
+        try:
+            with store.writing():
+                return self._run(store, on_progress)
+        finally:
+            store.close()
+            if self._engine.in_process and isinstance(self.policy, Closing):
+                self.policy.close()
+
+    def _run(self, store: ResultStore, on_progress: Callable[[Progress], None]) -> EvalResult:
         content = store.config()
-        runs = content["runs"]
-        store.write_config({**content, "runs": [*runs, {**run_conditions(), "engine": self.config.engine}]})
+        runs = content.get("runs", [])
+        name = {POLICY_NAME: self.policy.name} if self._engine.in_process else {}
+        store.write_config({**content, **name, "runs": [*runs, {**run_conditions(), "engine": self.config.engine}]})
         try:
             outcome = self._engine.run(self, store, len(runs), on_progress)
         except (ConfigError, EngineError):
             store.discard()
             raise
-        return self._summarise(store, outcome)
-
-    def _summarise(self, store: ResultStore, outcome: Outcome) -> EvalResult:
-        """Write the summary of all records in the folder, and return it with them."""
-        records, planned = store.records(), self.planned
-        summary = summarise(
-            records.values(),
-            planned,
-            suite=self.suite.name,
-            policy=outcome.policy,
-            instructions=self.suite.instructions,
-            conditions=store.config().get("conditions", {}),
-        )
-        store.write_summary(summary.to_dict(), markdown(summary))
-        return EvalResult(
-            summary=summary,
-            records=tuple(records[key] for key in planned if key in records),
-            folder=store.folder,
-            interrupted=outcome.interrupted,
-            causes=outcome.causes,
+        name = store.config().get(POLICY_NAME) or self.config.policy_name
+        return write_results(
+            store, self.suite, self.planned, name, interrupted=outcome.interrupted, causes=outcome.causes
         )
 
 
@@ -147,7 +140,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
     """
     suite = simulator.suite(config.suite, config.protocol)
-    tasks, episodes = _chosen_episodes(config, suite)
+    tasks, episodes = chosen_episodes(config, suite)
     _check_make(simulator, config)
     _check_record(config)
     _check_policy(config)
@@ -156,15 +149,21 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     return suite, tasks, episodes
 
 
-def _chosen_episodes(config: EvalConfig, suite: Suite) -> tuple[tuple[int, ...], dict[int, tuple[int, ...]]]:
-    """The tasks, and which episodes of each."""
+def chosen_episodes(config: EvalConfig, suite: Suite) -> tuple[tuple[int, ...], dict[int, tuple[int, ...]]]:
+    """The tasks to run, and which episodes of each; of a shard, its own.
+
+    Raises:
+        ConfigError, SpecError: there are no such tasks or episodes.
+    """
     tasks = parse_tasks(config.tasks, len(suite.instructions), suite.tasks)
     if config.tasks.strip() == ALL:
         tasks = tuple(task for task in tasks if suite.episodes_of(task))
     missing = [task for task in tasks if not suite.episodes_of(task)]
     if missing:
         raise ConfigError(f"protocol {config.protocol!r} has no episodes of task {missing[0]} of {suite.name}")
-    return tasks, {task: episode_indices(config.episodes, suite.episodes_of(task), suite.every) for task in tasks}
+    episodes = {task: episode_indices(config.episodes, suite.episodes_of(task), suite.every) for task in tasks}
+    own = shard(suite, tasks, episodes, *parse_shard(config.shard))
+    return tuple(own), own
 
 
 def _check_make(simulator: Simulator, config: EvalConfig) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from vecenv_eval.conditions import stored_as
+from vecenv_eval.config import EvalConfig
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store import Record, ResultStore
 
@@ -46,10 +48,15 @@ class Sink(Protocol):
 
 
 class FolderSink:
-    """Writes into a results folder."""
+    """Writes into a results folder.
 
-    def __init__(self, store: ResultStore) -> None:
-        self._store = store
+    Args:
+        store: the folder.
+        config: what it evaluates.
+    """
+
+    def __init__(self, store: ResultStore, config: EvalConfig) -> None:
+        self._store, self._config = store, config
 
     @property
     def folder(self) -> Path:
@@ -76,4 +83,5 @@ class FolderSink:
 
     def write_conditions(self, conditions: dict[str, Any]) -> None:
         """Put the conditions into ``config.json``."""
+        conditions = conditions | stored_as(self._config, self._store.rows.describe())
         self._store.write_config({**self._store.config(), "conditions": conditions})

@@ -8,43 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.fakes import FakeEnv, FakeWorld
+from support.fakes import Worlds
 from vecenv_eval.campaign import CAMPAIGN, Campaign, is_campaign, legs, markdown
 from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.episodes import Suite
+from vecenv_eval.merge import merge
 from vecenv_eval.report.run import read_run
-from vecenv_eval.simulator import Simulator
 from vecenv_eval.store import ResultStore, StoreError
-
-
-class Worlds:
-    """Two suites: in the second one, the odd tasks alone are planned, which nobody solves."""
-
-    def __init__(self) -> None:
-        self.world = FakeWorld()
-        self.made: list[tuple[str, int | None]] = []
-
-    def suite(self, name: str, protocol: str) -> Suite:
-        if name not in ("libero_goal", "libero_10"):
-            raise ConfigError(f"unknown suite {name!r}")
-        return replace(self.world.suite, name=name)
-
-    def make(self, suite: str, *, seed: int | None = None, **arguments: Any) -> FakeEnv:
-        self.made.append((suite, seed))
-        env = self.world.make("fake_suite", **arguments)
-        reset = env.reset
-
-        def renamed() -> Any:
-            info = reset()
-            ids = tuple(text.replace("fake_suite", suite) for text in info.episode_id)
-            return replace(info, suite=suite, episode_id=ids)
-
-        env.reset = renamed  # type: ignore[method-assign]
-        return env
-
-    @property
-    def simulator(self) -> Simulator:
-        return Simulator(self.suite, self.make)
 
 
 def config(**settings: Any) -> EvalConfig:
@@ -128,3 +97,49 @@ def test_a_report_of_several_seeds_asks_which(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"several seeds: name one, or two to compare them: .*seed-0, .*seed-7"):
         read_run(tmp_path / "c")
     assert [suite.suite for suite in read_run(tmp_path / "c" / "seed-7").suites] == ["libero_goal", "libero_10"]
+
+
+def test_a_repeated_command_continues_the_same_campaign_and_no_other(tmp_path: Path) -> None:
+    Campaign(config(), tmp_path / "c", Worlds().simulator).run()
+    worlds = Worlds()
+    Campaign(config(num_envs=3), tmp_path / "c", worlds.simulator).run()
+    assert worlds.made == []
+    with pytest.raises(StoreError, match=r"another evaluation \(there and here: max_steps not set and 3\)"):
+        Campaign(config(max_steps=3), tmp_path / "c", Worlds().simulator).run()
+
+
+def test_shards_of_a_campaign_are_merged_run_by_run(tmp_path: Path) -> None:
+    whole, _ = Campaign(config(seeds="0,7"), tmp_path / "whole", Worlds().simulator).run()
+    parts = [tmp_path / "a", tmp_path / "b"]
+    for number, folder in enumerate(parts, start=1):
+        Campaign(config(seeds="0,7", shard=f"{number}/2"), folder, Worlds().simulator).run()
+    half = merge(tmp_path / "merged", parts[:1], simulator=Worlds().simulator)
+    assert half.summary is not None
+    assert [row.missing for row in half.summary.suites] == [20, 20]
+    merged = merge(tmp_path / "merged", parts, simulator=Worlds().simulator)
+    assert merged.ok
+    assert merged.summary == whole
+    for name in ("summary.json", "report.md"):
+        assert (tmp_path / "merged" / name).read_text() == (tmp_path / "whole" / name).read_text()
+    assert Campaign.open(tmp_path / "merged", Worlds().simulator).run()[0] == whole
+
+
+def test_a_run_that_no_shard_has_begun_is_missing_in_the_merged_campaign(tmp_path: Path) -> None:
+    first = Campaign(config(shard="1/2"), tmp_path / "a", Worlds().simulator)
+    first.legs = first.legs[:1]
+    first.run()
+    merged = merge(tmp_path / "merged", [tmp_path / "a"], simulator=Worlds().simulator)
+    assert not merged.ok
+    assert [result.summary.total.missing for result in merged.results] == [10, 20]
+    summary, results = Campaign.open(tmp_path / "merged", Worlds().simulator).run()
+    assert all(result.ok for result in results)
+    assert [row.episodes for row in summary.suites] == [20, 20]
+
+
+def test_a_campaign_and_a_single_run_are_not_merged(tmp_path: Path) -> None:
+    Campaign(config(), tmp_path / "a", Worlds().simulator).run()
+    with pytest.raises(StoreError, match=r"holds several suites or seeds, .*libero_goal does not"):
+        merge(tmp_path / "merged", [tmp_path / "a", tmp_path / "a" / "libero_goal"], simulator=Worlds().simulator)
+    Campaign(config(seeds="1,2"), tmp_path / "b", Worlds().simulator).run()
+    with pytest.raises(StoreError, match="not from one evaluation: seeds not set and '1,2'"):
+        merge(tmp_path / "merged", [tmp_path / "a", tmp_path / "b"], simulator=Worlds().simulator)

@@ -250,7 +250,7 @@ def damage(folder: Path, file: str, content: str | bytes | None) -> Path:
     [
         ("config.json", None, "is not a results folder"),
         ("config.json", "{", "config.json cannot be read"),
-        ("config.json", "[]", "does not say which suite"),
+        ("config.json", "[]", "cannot be read: it holds no JSON object"),
         ("config.json", b"\xff\xfe\x00", "cannot be read"),
         ("episodes.jsonl", "nonsense\n", "is not an episode"),
         ("episodes.jsonl", b"\xff\n", "cannot be read"),

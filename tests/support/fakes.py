@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
+from vecenv_eval.config import ConfigError
 from vecenv_eval.episodes import Suite
 from vecenv_eval.simulator import Simulator
 
@@ -195,3 +197,33 @@ class FakeWorld:
     @property
     def simulator(self) -> Simulator:
         return Simulator(lambda name, protocol: self.suite, self.make)
+
+
+class Worlds:
+    """Two suites: in the second one, the odd tasks alone are planned, which nobody solves."""
+
+    def __init__(self) -> None:
+        self.world = FakeWorld()
+        self.made: list[tuple[str, int | None]] = []
+
+    def suite(self, name: str, protocol: str) -> Suite:
+        if name not in ("libero_goal", "libero_10"):
+            raise ConfigError(f"unknown suite {name!r}")
+        return replace(self.world.suite, name=name)
+
+    def make(self, suite: str, *, seed: int | None = None, **arguments: Any) -> FakeEnv:
+        self.made.append((suite, seed))
+        env = self.world.make("fake_suite", **arguments)
+        reset = env.reset
+
+        def renamed() -> Any:
+            info = reset()
+            ids = tuple(text.replace("fake_suite", suite) for text in info.episode_id)
+            return replace(info, suite=suite, episode_id=ids)
+
+        env.reset = renamed  # type: ignore[method-assign]
+        return env
+
+    @property
+    def simulator(self) -> Simulator:
+        return Simulator(self.suite, self.make)

@@ -37,7 +37,11 @@ def eval_command(
     config: Path | None = typer.Option(
         None, help="YAML file of settings, by the names of EvalConfig's fields; options override it."
     ),
-    out: Path | None = typer.Option(None, help="Results folder to make.", show_default="results/TIME_SUITE_POLICY"),
+    out: Path | None = typer.Option(
+        None,
+        help="Results folder to make; the same settings continue one that is there.",
+        show_default="results/TIME_SUITE_POLICY",
+    ),
     resume: Path | None = typer.Option(
         None, help="Results folder to continue; it keeps its settings.", show_default="none"
     ),
@@ -81,12 +85,15 @@ def _default_folder(config: EvalConfig) -> Path:
 
 
 def _run_new(config: EvalConfig, folder: Path, quiet: bool) -> int:
-    """A new evaluation; no folder is made before the settings were checked."""
-    from vecenv_eval.results import begin
+    """A new evaluation, or the same one continued; no folder is made before the settings were checked."""
+    from vecenv_eval.campaign import CAMPAIGN
+    from vecenv_eval.results import open_or_begin
     from vecenv_eval.runner import Evaluation
 
+    if (folder / CAMPAIGN).is_file():
+        fail(f"{folder} is already there and holds several suites or seeds: name another folder")
     evaluation = Evaluation(config)
-    return _run(evaluation, begin(config, folder), quiet)
+    return _run(evaluation, open_or_begin(config, folder), quiet)
 
 
 def _resume(folder: Path, given: dict[str, Any], file: Path | None, out: Path | None) -> tuple[Evaluation, ResultStore]:
@@ -128,12 +135,16 @@ def _run_campaign(campaign: Campaign, quiet: bool) -> int:
         def report(leg: Leg, progress: Progress) -> None:
             on_progress(progress)
 
+        def begun(leg: Leg, store: ResultStore) -> None:
+            if leg is campaign.legs[0] and (notice := store.rows.notice()):
+                console.print(notice, style="yellow", markup=False, highlight=False, soft_wrap=True)
+
         def finished(leg: Leg, result: EvalResult) -> None:
             seed = "" if leg.seed is None else f", seed {leg.seed}"
             console.print(f"[bold]{leg.suite}[/bold]{seed}")
-            _print_result(console, result)
+            print_result(console, result)
 
-        summary, results = campaign.run(report, finished)
+        summary, results = campaign.run(report, finished, begun)
     console.print(Markdown(markdown(summary)))
     typer.echo(campaign.folder)
     if any(result.interrupted for result in results):
@@ -160,14 +171,17 @@ def _run(evaluation: Evaluation, store: ResultStore, quiet: bool) -> int:
     from rich.console import Console
 
     console = Console(quiet=quiet)
+    if notice := store.rows.notice():
+        console.print(notice, style="yellow", markup=False, highlight=False, soft_wrap=True)
     with _user_errors(), _progress(console) as on_progress:
         result = evaluation.run(store, on_progress)
-    _print_result(console, result)
+    print_result(console, result)
     typer.echo(result.folder)
     return 130 if result.interrupted else 0 if result.ok else 1
 
 
-def _print_result(console: Console, result: EvalResult) -> None:
+def print_result(console: Console, result: EvalResult) -> None:
+    """Print how an evaluation ended: its table, what is wrong, and how to go on."""
     from vecenv_eval.report import STAND_INS, closing_line, stand_in_lines, table
 
     console.print(table(result.summary))

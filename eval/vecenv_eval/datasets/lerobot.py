@@ -24,6 +24,7 @@ import numpy as np
 from vecenv.contract import ACTION_DIM
 from vecenv.errors import InvalidFile, MissingDependency
 from vecenv_eval.datasets.statistics import ImageCounts, Statistics, of_values, together
+from vecenv_eval.episodes import Episode
 from vecenv_eval.store import Record
 from vecenv_eval.video.episodes import camera_images
 from vecenv_eval.video.writer import VideoWriter
@@ -121,15 +122,34 @@ class LeRobotWriter:
         if record.fault or record.error:
             _discard(rollout)
             return
-        self._check_features(rollout, record)
-        columns = self._columns(rollout, record)
-        stats = {name: of_values(values) for name, values in columns.items()}
-        stats |= {key: counts.statistics() for key, counts in rollout.counts.items()}
+        self._check_features(_features(rollout, self._info["fps"]), record.key, ROBOTS.get(record.suite, "panda"))
+        task = self._tasks.setdefault(record.instruction, len(self._tasks))
+        videos = {key: video.path for key, video in rollout.videos.items()}
+        about = {
+            "tasks": [record.instruction],
+            "success": bool(record.success),
+            "suite": record.suite,
+            "task_id": record.task,
+            "source_episode": record.episode,
+        }
+        images = {key: counts.statistics() for key, counts in rollout.counts.items()}
+        self._add(self._columns(rollout, record, task), images, videos, about)
+
+    def _add(
+        self,
+        columns: Mapping[str, np.ndarray],
+        images: Mapping[str, Statistics],
+        videos: Mapping[str, Path],
+        about: Mapping[str, Any],
+    ) -> None:
+        """Add an episode: its frames, the statistics of its images, its videos (which are moved), and what is told."""
+        stats = {name: of_values(values) for name, values in columns.items()} | dict(images)
         self._stats = {
             name: together([self._stats[name], s] if name in self._stats else [s]) for name, s in stats.items()
         }
-        self._rows.append((_table(columns), self._episode(rollout, record, stats)))
-        self.episodes, self._frames = self.episodes + 1, self._frames + len(rollout.actions)
+        ticks = len(columns["index"])
+        self._rows.append((_table(columns), self._episode(ticks, stats, videos, about)))
+        self.episodes, self._frames = self.episodes + 1, self._frames + ticks
         if len(self._rows) >= FLUSH:
             self.flush()
 
@@ -183,18 +203,17 @@ class LeRobotWriter:
         rollout.videos[key].add(image)
         self._info.setdefault("fps", fps)
 
-    def _check_features(self, rollout: _Rollout, record: Record) -> None:
+    def _check_features(self, features: dict[str, dict[str, Any]], episode: Episode, robot: str) -> None:
         """Fix the features with the first episode; hold every other one against them."""
-        features = _features(rollout, self._info["fps"])
         known = self._info.setdefault("features", features)
         for name in features.keys() | known.keys():
             ours, theirs = features.get(name, {}).get("shape"), known.get(name, {}).get("shape")
             if ours != theirs:
-                raise DatasetError(f"{self.root}: {name} of {record.key.id} is {ours}, in the dataset it is {theirs}")
+                raise DatasetError(f"{self.root}: {name} of {episode.id} is {ours}, in the dataset it is {theirs}")
         if "codebase_version" not in self._info:
             self._info |= {
                 "codebase_version": VERSION,
-                "robot_type": ROBOTS.get(record.suite, "panda"),
+                "robot_type": robot,
                 "chunks_size": CHUNK,
                 "data_files_size_in_mb": 100,
                 "video_files_size_in_mb": 200,
@@ -202,11 +221,10 @@ class LeRobotWriter:
                 "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
             }
 
-    def _columns(self, rollout: _Rollout, record: Record) -> dict[str, np.ndarray]:
+    def _columns(self, rollout: _Rollout, record: Record, task: int) -> dict[str, np.ndarray]:
         """An episode's frames, by feature: [T, n] or [T]."""
         ticks = len(rollout.actions)
         last = np.arange(ticks) == ticks - 1
-        task = self._tasks.setdefault(record.instruction, len(self._tasks))
         return {
             "observation.state": np.stack(rollout.states),
             "action": np.stack(rollout.actions),
@@ -214,28 +232,32 @@ class LeRobotWriter:
             "next.success": last & bool(record.success),
             "timestamp": (np.arange(ticks) / self._info["fps"]).astype(np.float32),
             "frame_index": np.arange(ticks),
+            **self._indices(ticks, task),
+        }
+
+    def _indices(self, ticks: int, task: int) -> dict[str, np.ndarray]:
+        """The columns that depend on what the dataset holds already, [T] each."""
+        return {
             "episode_index": np.full(ticks, self.episodes),
             "index": np.arange(self._frames, self._frames + ticks),
             "task_index": np.full(ticks, task),
         }
 
-    def _episode(self, rollout: _Rollout, record: Record, stats: Mapping[str, Statistics]) -> dict[str, Any]:
+    def _episode(
+        self, ticks: int, stats: Mapping[str, Statistics], videos: Mapping[str, Path], about: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """The row of an episode in ``meta/episodes``; its videos move to their places."""
-        ticks = len(rollout.actions)
         row: dict[str, Any] = {
             "episode_index": self.episodes,
-            "tasks": [record.instruction],
+            "tasks": about["tasks"],
             "length": ticks,
-            "success": bool(record.success),
-            "suite": record.suite,
-            "task_id": record.task,
-            "source_episode": record.episode,
+            **{name: value for name, value in about.items() if name != "tasks"},
             "dataset_from_index": self._frames,
             "dataset_to_index": self._frames + ticks,
         }
         chunk, file = divmod(self.episodes, CHUNK)
-        for key, video in rollout.videos.items():
-            video.path.replace(self._parent(_VIDEO.format(chunk, file, key=key)))
+        for key, video in videos.items():
+            video.replace(self._parent(_VIDEO.format(chunk, file, key=key)))
             row |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
             row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": ticks / self._info["fps"]}
         for name, found in stats.items():

@@ -7,15 +7,14 @@ later error change nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from vecenv_eval.engines.ray_actor import Report
 from vecenv_eval.episodes import Episode
-from vecenv_eval.results import count
+from vecenv_eval.results import POLICY_NAME, count
+from vecenv_eval.runner import Evaluation
 from vecenv_eval.sink import FolderSink
 from vecenv_eval.store import Record, ResultStore
-
-# Where ``config.json`` has the policy's name, which only those processes know that make the policy.
-_POLICY = "policy_name"
 
 
 class Ledger:
@@ -23,8 +22,7 @@ class Ledger:
 
     Args:
         store: the results folder.
-        planned: every episode of the evaluation.
-        instructions: language instruction of each task.
+        evaluation: what is evaluated.
 
     Attributes:
         causes: what failed, one line each, without repetition.
@@ -32,24 +30,19 @@ class Ledger:
         error_batches: reports of this run that were errors.
     """
 
-    def __init__(self, store: ResultStore, planned: Sequence[Episode], instructions: Sequence[str]) -> None:
+    def __init__(self, store: ResultStore, evaluation: Evaluation) -> None:
         self.causes: dict[str, None] = {}
         self.verdicts = self.error_batches = 0
-        self._store, self._sink = store, FolderSink(store)
-        self._planned, self._instructions = planned, instructions
-        wanted = frozenset(planned)
+        self._store, self._sink = store, FolderSink(store, evaluation.config)
+        self._planned, self._instructions = evaluation.planned, evaluation.suite.instructions
+        wanted = frozenset(self._planned)
         self._records = {key: r for key, r in store.records().items() if key in wanted and not r.error}
-        self._conditions = store.config().get("conditions")
+        self._conditions: dict[str, Any] | None = None
 
     @property
     def missing(self) -> list[Episode]:
         """Planned episodes without a verdict, in order."""
         return [key for key in self._planned if key not in self._records or self._records[key].error]
-
-    @property
-    def policy(self) -> str:
-        """Name of the policy, "" before anybody said it."""
-        return self._store.config().get(_POLICY, "")
 
     @property
     def counts(self) -> dict[str, int]:
@@ -105,8 +98,9 @@ class Ledger:
 
     def note_policy(self, name: str) -> None:
         """Remember the name of the policy."""
-        if self.policy != name:
-            self._store.write_config({**self._store.config(), _POLICY: name})
+        content = self._store.config()
+        if content.get(POLICY_NAME) != name:
+            self._store.write_config({**content, POLICY_NAME: name})
 
     def _is_new(self, record: Record) -> bool:
         known = self._records.get(record.key)

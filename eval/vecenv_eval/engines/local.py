@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.engine import Outcome
 from vecenv_eval.episodes import Episode, Stream
 from vecenv_eval.loop import EpisodeLoop
-from vecenv_eval.policies import Closing
 from vecenv_eval.results import Progress
+from vecenv_eval.runner import Evaluation
 from vecenv_eval.sink import FolderSink
-
-if TYPE_CHECKING:
-    from vecenv_eval.runner import Evaluation
-    from vecenv_eval.store import ResultStore
+from vecenv_eval.store import ResultStore
 
 
 class LocalEngine:
@@ -31,13 +28,13 @@ class LocalEngine:
         self, evaluation: Evaluation, store: ResultStore, index: int, on_progress: Callable[[Progress], None]
     ) -> Outcome:
         """Run what has no verdict; see :class:`vecenv_eval.engine.Engine`."""
-        policy, planned = evaluation.policy, frozenset(evaluation.planned)
+        planned = frozenset(evaluation.planned)
         loop = EpisodeLoop(
             evaluation.config,
             evaluation.suite,
-            policy,
+            evaluation.policy,
             evaluation.simulator,
-            FolderSink(store),
+            FolderSink(store, evaluation.config),
             planned=planned,
             on_progress=on_progress,
             index=index,
@@ -46,9 +43,5 @@ class LocalEngine:
         def again(episodes: Collection[Episode]) -> list[Stream]:
             return evaluation.streams(done=planned - frozenset(episodes))
 
-        try:
-            interrupted = loop.run(evaluation.streams(store.done()), again)
-        finally:
-            if isinstance(policy, Closing):
-                policy.close()
-        return Outcome(interrupted=interrupted, causes=tuple(loop.causes), policy=policy.name)
+        interrupted = loop.run(evaluation.streams(store.done()), again)
+        return Outcome(interrupted=interrupted, causes=tuple(loop.causes))

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import ray
 from ray.exceptions import RayError, RayTaskError
@@ -31,10 +31,8 @@ from vecenv_eval.engines.ray_options import RayOptions, on_cpu, resources, room
 from vecenv_eval.engines.work import WorkQueue
 from vecenv_eval.episodes import Episode
 from vecenv_eval.results import Progress
-
-if TYPE_CHECKING:
-    from vecenv_eval.runner import Evaluation
-    from vecenv_eval.store import ResultStore
+from vecenv_eval.runner import Evaluation
+from vecenv_eval.store import ResultStore
 
 # Seconds after which a driver looks around although nothing has arrived.
 _LOOK_S = 1.0
@@ -67,9 +65,9 @@ class RayEngine:
         self, evaluation: Evaluation, store: ResultStore, index: int, on_progress: Callable[[Progress], None]
     ) -> Outcome:
         """Run what has no verdict; see :class:`vecenv_eval.engine.Engine`."""
-        ledger = Ledger(store, evaluation.planned, evaluation.suite.instructions)
+        ledger = Ledger(store, evaluation)
         if not ledger.missing:
-            return Outcome(interrupted=False, causes=(), policy=ledger.policy or evaluation.config.policy_name)
+            return Outcome(interrupted=False, causes=())
         wanted = resources(self._options, evaluation.config)
         interrupted = False
         driver = _Driver(evaluation, ledger, self._options, on_progress)
@@ -79,11 +77,7 @@ class RayEngine:
                 driver.run(Crew(size, _assignment(evaluation, wanted, index), wanted), index)
         except KeyboardInterrupt:
             interrupted = True
-        return Outcome(
-            interrupted=interrupted,
-            causes=tuple(ledger.causes),
-            policy=ledger.policy or evaluation.config.policy_name,
-        )
+        return Outcome(interrupted=interrupted, causes=tuple(ledger.causes))
 
     def _size(self, wanted: dict[str, float], episodes: int) -> int:
         """How many actors to start.

@@ -65,10 +65,15 @@ def on_cpu(config: EvalConfig) -> bool:
     return config.backend in _CPU_BACKENDS
 
 
+def needs_gpu(config: EvalConfig) -> bool:
+    """Whether the physics cannot run without a GPU."""
+    return config.backend not in _NO_GPU
+
+
 def resources(options: RayOptions, config: EvalConfig) -> dict[str, float]:
     """What an actor takes of its node, by Ray's names."""
     cpus = options.cpus or config.num_threads or 1
-    gpus = options.gpus if options.gpus is not None else 0 if config.backend in _NO_GPU else 1
+    gpus = options.gpus if options.gpus is not None else int(needs_gpu(config))
     return {"CPU": cpus, "GPU": gpus}
 
 

@@ -1,0 +1,221 @@
+"""Records in a SQLite database, ``episodes.sqlite``: one table, ``episodes``, a row an episode.
+
+Every append is one transaction that is synced to the disk. On a local file system the database has a write-ahead log,
+so that readers and the writer do not wait for one another; on any other it has SQLite's rollback journal, because the
+log does not work over a network.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from vecenv_eval.episodes import Episode
+from vecenv_eval.store.filesystems import file_system, is_local
+from vecenv_eval.store.record import Record, StoreError, from_plain, to_plain
+
+DATABASE = "episodes.sqlite"
+# Version of the table, in the database's ``user_version``.
+SCHEMA = 1
+# Columns and their types, by the names of Record's fields.
+COLUMNS = {
+    "suite": "TEXT NOT NULL",
+    "task": "INTEGER NOT NULL",
+    "episode": "INTEGER NOT NULL",
+    "instruction": "TEXT NOT NULL",
+    "success": "BOOLEAN NOT NULL",
+    "success_first": "BOOLEAN NOT NULL",
+    "success_final": "BOOLEAN NOT NULL",
+    "num_steps": "INTEGER NOT NULL",
+    "reward": "REAL",
+    "fault": "TEXT NOT NULL",
+    "error": "TEXT NOT NULL",
+    "sanitized": "INTEGER NOT NULL",
+    "sanitized_first": "INTEGER",
+    "run": "INTEGER NOT NULL",
+    "batch": "INTEGER NOT NULL",
+    "setup_s": "REAL NOT NULL",
+    "wall_s": "REAL NOT NULL",
+    "policy_s": "REAL NOT NULL",
+    "physics_s": "REAL NOT NULL",
+    "images_s": "REAL NOT NULL",
+    "extras": "JSON NOT NULL",
+    "stand_ins": "JSON NOT NULL",
+}
+KEY = ("suite", "task", "episode")
+_NAMES = ", ".join(COLUMNS)
+_CREATE = f"CREATE TABLE episodes ({', '.join(map(' '.join, COLUMNS.items()))}, PRIMARY KEY ({', '.join(KEY)}))"
+# As Record.replaces: the latest record counts, but no error replaces a verdict.
+_INSERT = (
+    f"INSERT INTO episodes ({_NAMES}) VALUES ({', '.join(f':{name}' for name in COLUMNS)}) "
+    f"ON CONFLICT ({', '.join(KEY)}) "
+    f"DO UPDATE SET {', '.join(f'{name} = excluded.{name}' for name in COLUMNS if name not in KEY)} "
+    "WHERE excluded.error = '' OR episodes.error <> ''"
+)
+# Seconds to wait for another process that holds the database.
+_TIMEOUT_S = 30.0
+
+
+class SqliteRows:
+    """The records of a results folder in ``episodes.sqlite``.
+
+    Args:
+        folder: the results folder.
+
+    Attributes:
+        path: the file.
+        file_system: the type of the file system it is on.
+        journal: SQLite's journal mode for it: ``"wal"``, or ``"delete"`` where the file system is not local.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / DATABASE
+        self.file_system = file_system(folder)
+        self.journal = "wal" if is_local(self.file_system) else "delete"
+        self._connection: sqlite3.Connection | None = None
+
+    def create(self) -> None:
+        """Make the database, without records, if there is none."""
+        with self._errors("written"):
+            self._writer()
+
+    def append(self, records: Iterable[Record]) -> None:
+        """Add records in one transaction and wait until it is on the disk."""
+        rows = [sqlite_values(to_plain(record)) for record in records]
+        with self._errors("written"):
+            connection = self._writer()
+            with connection:
+                connection.executemany(_INSERT, rows)
+
+    def read(self) -> dict[Episode, Record]:
+        """The record of each episode, by episode, in the order in which they first came.
+
+        Raises:
+            StoreError: the database is damaged, or its table is of another version.
+        """
+        if not self.path.exists():
+            return {}
+        with self._errors("read"), closing(self._reader()) as connection:
+            if not self._has_table(connection):
+                return {}
+            found = connection.execute(f"SELECT {_NAMES} FROM episodes ORDER BY rowid").fetchall()
+        records = [self._record(dict(zip(COLUMNS, values, strict=True))) for values in found]
+        return {record.key: record for record in records}
+
+    def check(self) -> None:
+        """Raise `StoreError` when the database is damaged."""
+        if self.path.exists():
+            with self._errors("read"), closing(self._reader()) as connection:
+                (said, *_), *_ = connection.execute("PRAGMA quick_check").fetchall()
+            if said != "ok":
+                raise StoreError(f"{self.path} is damaged: {said.splitlines()[-1]}")
+        self.read()
+
+    def describe(self) -> str:
+        """How the records are kept."""
+        if self.journal == "wal":
+            return "sqlite, write-ahead log"
+        return f"sqlite, no write-ahead log (file system {self.file_system})"
+
+    def notice(self) -> str:
+        """What whoever starts a run should know; "" for nothing."""
+        if self.journal == "wal":
+            return ""
+        return (
+            f"{self.path.name}: SQLite's write-ahead log is off, because a file system of type {self.file_system} may "
+            "be shared over a network; readers may have to wait for the writer."
+        )
+
+    def close(self) -> None:
+        """Close the database; with the last connection its log becomes part of it."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with self._errors("closed"):
+                connection.close()
+
+    def remove(self) -> None:
+        """Delete the database, and its log and journal."""
+        self.close()
+        for ending in ("", "-wal", "-shm", "-journal"):
+            self.path.with_name(self.path.name + ending).unlink(missing_ok=True)
+
+    def _writer(self) -> sqlite3.Connection:
+        """The connection that writes, with a table to write to."""
+        if self._connection is None:
+            connection = sqlite3.connect(self.path, timeout=_TIMEOUT_S, check_same_thread=False)
+            try:
+                ((self.journal,),) = connection.execute(f"PRAGMA journal_mode = {self.journal}").fetchall()
+                connection.execute("PRAGMA synchronous = FULL")
+                with connection:
+                    connection.execute("BEGIN IMMEDIATE")
+                    if not self._has_table(connection):
+                        connection.execute(_CREATE)
+                        connection.execute(f"PRAGMA user_version = {SCHEMA}")
+            except BaseException:
+                connection.close()
+                raise
+            self._connection = connection
+        return self._connection
+
+    def _reader(self) -> sqlite3.Connection:
+        """A connection that changes nothing."""
+        uri = f"{self.path.resolve().as_uri()}?mode=ro"
+        connection = sqlite3.connect(uri, uri=True, timeout=_TIMEOUT_S)
+        try:
+            connection.execute("PRAGMA schema_version")
+        except sqlite3.OperationalError:
+            connection.close()
+            if self.path.with_name(self.path.name + "-wal").exists():
+                raise
+            # In a folder without write permission SQLite cannot make the log's files, and does not need them.
+            connection = sqlite3.connect(f"{uri}&immutable=1", uri=True)
+        return connection
+
+    def _has_table(self, connection: sqlite3.Connection) -> bool:
+        """Whether there is the table; a database without anything in it is one that was not begun.
+
+        Raises:
+            StoreError: there is something else, or another version of it.
+        """
+        ((version,),) = connection.execute("PRAGMA user_version").fetchall()
+        tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        if not tables and version == 0:
+            return False
+        if "episodes" not in tables:
+            raise StoreError(f"{self.path} is a database without a table of episodes")
+        if version != SCHEMA:
+            raise StoreError(f"{self.path} has version {version} of the table of episodes; this vecenv reads {SCHEMA}")
+        return True
+
+    def _record(self, values: Mapping[str, Any]) -> Record:
+        try:
+            flags = {name: bool(values[name]) for name, kind in COLUMNS.items() if kind.startswith("BOOLEAN")}
+            texts = {name: json.loads(values[name]) for name, kind in COLUMNS.items() if kind.startswith("JSON")}
+            return from_plain({**values, **flags, **texts})
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            which = "/".join(str(values[name]) for name in KEY)
+            raise StoreError(f"{self.path}: the row of {which} is not an episode: {error}") from None
+
+    @contextmanager
+    def _errors(self, done: str) -> Iterator[None]:
+        """What SQLite raises becomes a `StoreError` that names the file."""
+        try:
+            yield
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            raise StoreError(f"{self.path} cannot be {done}: {error}") from None
+
+
+def sqlite_values(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A plain row as SQLite stores it: values without a fixed form as JSON text."""
+    return {name: _stored(value, COLUMNS.get(name, "")) for name, value in row.items()}
+
+
+def _stored(value: Any, kind: str) -> Any:
+    if kind.startswith("JSON"):
+        return json.dumps(value)
+    # SQLite stores UTF-8: what has no such form (a surrogate, from a file name of another encoding) is escaped.
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
