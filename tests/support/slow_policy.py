@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 
 import numpy as np
@@ -33,3 +34,10 @@ class FailingPolicy(SlowPolicy):
 
     def __init__(self) -> None:
         raise ValueError("negative seconds")
+
+
+class FatalPolicy(SlowPolicy):
+    """Ends its process at its first action, as a segmentation fault would."""
+
+    def act(self, env: BatchEnv) -> np.ndarray:
+        os._exit(1)

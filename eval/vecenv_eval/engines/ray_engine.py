@@ -111,7 +111,7 @@ class _Driver:
         self._evaluation, self._ledger, self._options = evaluation, ledger, options
         self._on_progress = on_progress
         self._lost: Counter[Episode] = Counter()
-        self._units = self._finished = 0
+        self._units = self._finished = self._reports = 0
         self._alive, self._began = time.monotonic(), 0.0
 
     def run(self, crew: Crew, index: int) -> None:
@@ -261,7 +261,6 @@ class _Driver:
                     seat.waits_for = None
 
     def _report(self) -> None:
-        running = any(seat.info is not None for seat in self._crew.seats)
         self._on_progress(
             Progress(
                 **self._ledger.counts,
@@ -269,9 +268,10 @@ class _Driver:
                 seconds=time.monotonic() - self._began if self._began else 0.0,
                 batch=self._finished,
                 num_batches=self._units + self._queue.units,
-                setting_up=not running,
+                setting_up=self._reports == 0,
             )
         )
+        self._reports += 1
 
 
 def _assignment(evaluation: Evaluation, wanted: dict[str, float], index: int) -> Assignment:

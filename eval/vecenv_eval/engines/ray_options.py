@@ -10,8 +10,8 @@ from vecenv_eval.config import ConfigError, EvalConfig
 
 # Backends that step on CPU threads; any other one is given a GPU.
 _CPU_BACKENDS = ("native", "physx_cpu")
-# `jax` runs on whatever there is: a GPU has to be asked for.
-_NO_GPU = (*_CPU_BACKENDS, "jax")
+# `jax` and `mjx` run on whatever there is: a GPU has to be asked for.
+_NO_GPU = (*_CPU_BACKENDS, "jax", "mjx")
 
 
 @dataclass(frozen=True, kw_only=True)
