@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pickle
 import sys
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,11 +30,15 @@ class ShardOutcome:
         interrupted: it was stopped by a signal.
         causes: what failed in it, one line each.
         refused: why it could not run at all.
+        failed: what was raised, one line; another attempt may fare better.
+        traceback: of that.
     """
 
     interrupted: bool = False
     causes: tuple[str, ...] = ()
     refused: str = ""
+    failed: str = ""
+    traceback: str = ""
 
 
 class ShardJob:
@@ -61,6 +66,9 @@ class ShardJob:
             result = evaluation.run(open_or_begin(config, folder))
         except VecenvError as error:
             return ShardOutcome(refused=" ".join(str(error).split()))
+        except Exception as error:  # what a policy's constructor raises, for example
+            line = f"{type(error).__name__}: {error}".splitlines()[0]
+            return ShardOutcome(failed=line, traceback=traceback.format_exc())
         return ShardOutcome(interrupted=result.interrupted, causes=result.causes)
 
     def checkpoint(self) -> DelayedSubmission:

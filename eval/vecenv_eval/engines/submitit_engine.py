@@ -271,22 +271,19 @@ class _Driver:
 
     def _end(self, shard: Shard, job: Any) -> None:
         outcome = _outcome_of(job)
-        if isinstance(outcome, ShardOutcome) and not outcome.interrupted and not outcome.refused:
-            shard.finished = True
-            self._causes.update(dict.fromkeys(outcome.causes))
-            return
-        if shard.done == shard.planned:
+        self._causes.update(dict.fromkeys(outcome.causes))
+        cause = outcome.refused or outcome.failed or ("it was stopped by a signal" if outcome.interrupted else "")
+        if not cause or shard.done == shard.planned:
             shard.finished = True
         elif shard.in_use:  # a job of an earlier run has it
             shard.submitted -= 1
         else:
-            refused = outcome.refused if isinstance(outcome, ShardOutcome) else ""
-            cause = refused or (outcome if isinstance(outcome, str) else "it was stopped by a signal")
-            shard.given_up = bool(refused) or shard.submitted >= self._options.attempts
-            self._refused = self._refused or refused
+            self._refused = self._refused or outcome.refused
+            shard.given_up = bool(outcome.refused) or shard.submitted >= self._options.attempts
+            line = f"shard {shard.number}, job {job.job_id}: {cause}"
             if shard.given_up:
-                self._causes[f"shard {shard.number}, job {job.job_id}: {cause}"] = None
-            ResultStore(self._folder).log_error(f"shard {shard.number}, job {job.job_id} ended: {cause}")
+                self._causes[line] = None
+            ResultStore(self._folder).log_error(f"{line}\n{outcome.traceback}")
 
     def _merge(self) -> None:
         """Bring the results folder up to date, and say how it stands."""
@@ -363,10 +360,9 @@ def _parameters(config: EvalConfig, given: Mapping[str, Any]) -> dict[str, Any]:
     return parameters
 
 
-def _outcome_of(job: Any) -> ShardOutcome | str:
-    """What a job returned, or in a line why it did not."""
+def _outcome_of(job: Any) -> ShardOutcome:
+    """What a job returned, or that it died."""
     try:
         return job.result()
-    except Exception as error:  # whatever submitit or the job raises says that it died
-        lines = [line for line in str(error).splitlines() if line.strip()]
-        return f"{type(error).__name__}: {lines[0].strip() if lines else 'no result'}"
+    except Exception as error:  # whatever submitit raises says that there is no result
+        return ShardOutcome(failed="it ended without a result", traceback=str(error))

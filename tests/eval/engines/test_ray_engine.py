@@ -180,6 +180,7 @@ def test_what_a_policy_or_environment_raises_costs_the_running_episodes(tmp_path
     assert verdicts(again) == verdicts(local(tmp_path / "local", FakeWorld()))
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("cluster")
 def test_a_run_of_nothing_but_errors_stops(tmp_path: Path) -> None:
     world = FakeWorld(raise_in={task: ValueError("no server") for task in range(4)})
@@ -188,6 +189,7 @@ def test_a_run_of_nothing_but_errors_stops(tmp_path: Path) -> None:
     assert result.causes == ("ValueError: no server",)
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("cluster")
 def test_an_episode_that_ends_its_process_has_an_error_and_costs_no_other_its_verdict(tmp_path: Path) -> None:
     result = on_ray(tmp_path / "run", FatalWorld(), {"actors": 2, "attempts": 2}, tasks="0-1")
@@ -212,6 +214,7 @@ def test_a_setting_that_the_environment_refuses_ends_the_run_without_a_folder(tm
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("cluster")
 def test_a_policy_that_cannot_be_made_on_any_actor_is_named(tmp_path: Path) -> None:
     with pytest.raises(EngineError, match=r"no actor could start: .*negative seconds"):

@@ -139,6 +139,7 @@ def test_a_job_that_is_killed_is_submitted_again_and_costs_no_verdict(tmp_path: 
     assert lines(folder) == 20
 
 
+@pytest.mark.heavy
 def test_a_job_that_is_preempted_continues(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     preempt = Signals(folder.resolve() / "shards" / "1-of-1", signal.SIGUSR2)
@@ -150,6 +151,7 @@ def test_a_job_that_is_preempted_continues(tmp_path: Path) -> None:
     assert verdicts(result) == verdicts(local(tmp_path / "local", policy=SLOW, tasks="0-1"))
 
 
+@pytest.mark.heavy
 def test_a_job_that_keeps_dying_is_given_up(tmp_path: Path) -> None:
     policy = "support.slow_policy:FatalPolicy"
     result = run(tmp_path / "run", policy=policy, tasks="0", engine_args={**LOCAL, "shards": 1, "attempts": 2})
@@ -159,9 +161,21 @@ def test_a_job_that_keeps_dying_is_given_up(tmp_path: Path) -> None:
     assert result.causes[0].startswith("shard 1, job")
 
 
-def test_what_a_job_refuses_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="negative seconds"):
-        run(tmp_path / "run", policy="support.slow_policy:FailingPolicy", engine_args={**LOCAL, "shards": 1})
+@pytest.mark.heavy
+def test_what_a_job_raises_is_named(tmp_path: Path) -> None:
+    policy = "support.slow_policy:FailingPolicy"
+    result = run(tmp_path / "run", policy=policy, engine_args={**LOCAL, "shards": 1, "attempts": 1})
+    assert re.fullmatch(r"shard 1, job \d+: ValueError: negative seconds", result.causes[0])
+    assert result.summary.total.missing == 20
+
+
+@pytest.mark.heavy
+def test_what_every_job_refuses_ends_the_run_without_a_row(tmp_path: Path) -> None:
+    world, config = FakeWorld(), config_of(engine_args={**LOCAL, "shards": 1})
+    world.refuse = ValueError("no such backend")
+    with pytest.raises(ConfigError, match="no such backend"):
+        evaluate(config, open_or_begin(config, tmp_path / "run"), simulator=world.simulator)
+    assert lines(tmp_path / "run") == 0
 
 
 def test_a_folder_keeps_its_number_of_shards_and_its_engine(tmp_path: Path) -> None:
