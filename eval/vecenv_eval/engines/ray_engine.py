@@ -119,7 +119,7 @@ class _Driver:
 
         Raises:
             ConfigError: the environment refuses a setting.
-            EngineError: no actor can start.
+            EngineError: no actor can start, and no episode of this run has a verdict.
         """
         self._crew, self._index = crew, index
         try:
@@ -133,6 +133,10 @@ class _Driver:
         except KeyboardInterrupt:
             self._take_last_reports()
             raise
+        except EngineError as error:
+            if not self._ledger.verdicts:
+                raise
+            self._ledger.note(str(error))  # what there is makes a result
         finally:
             crew.close()
 

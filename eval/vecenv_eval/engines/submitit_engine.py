@@ -33,8 +33,12 @@ from vecenv_eval.store import CONFIG, ResultStore, StoreError
 
 SHARDS, JOBS = "shards", "jobs"
 EXECUTORS = ("auto", "slurm", "local", "debug")
+# Seconds between two questions to the scheduler; submitit's own are 10 minutes apart.
+_ASK_S = 30.0
 # Seconds that jobs have to stop after Ctrl-C.
 _STOP_S = 30.0
+# Parameters with which a job would run its shard several times.
+_ONE_TASK = ("nodes", "tasks_per_node", "ntasks_per_node")
 # submitit's own limit is 5 minutes.
 _TIMEOUT_MIN = 24 * 60
 
@@ -212,8 +216,8 @@ class _Driver:
         self._evaluation, self._shards, self._executor, self._options = evaluation, shards, executor, options
         self._folder, self._on_progress = folder, on_progress
         self._causes: dict[str, None] = {}
-        self._refused = ""
-        self._began = time.monotonic()
+        self._refused = self._unsubmitted = ""
+        self._began = self._asked = time.monotonic()
         self._before = sum(record.num_steps for record in ResultStore(folder).records().values())
         self._merged, self._reports = -1, 0
 
@@ -222,6 +226,7 @@ class _Driver:
 
         Raises:
             ConfigError: the jobs say that they cannot run.
+            EngineError: no job can be submitted.
             StoreError: the shards cannot be merged.
         """
         interrupted = False
@@ -239,8 +244,11 @@ class _Driver:
         finally:
             self._stop()
         self._merge()
-        if self._refused and not any(shard.there for shard in self._shards):
-            raise ConfigError(self._refused)
+        if not any(shard.there for shard in self._shards):
+            if self._refused:
+                raise ConfigError(self._refused)
+            if self._unsubmitted:
+                raise EngineError(self._unsubmitted)
         return Outcome(interrupted=interrupted, causes=tuple(self._causes))
 
     @property
@@ -253,21 +261,26 @@ class _Driver:
             return
         try:
             with self._executor.batch():  # an array of jobs
-                for shard in ready:
-                    shard.job = self._executor.submit(shard.task)
+                jobs = [self._executor.submit(shard.task) for shard in ready]
         except (FailedJobError, OSError) as error:
-            for shard in ready:
-                shard.job = None
-            raise EngineError(f"jobs cannot be submitted: {' '.join(str(error).split())}") from error
-        for shard in ready:
+            self._unsubmitted = f"jobs cannot be submitted: {' '.join(str(error).split())}"
+            jobs = [None] * len(ready)
+        for shard, job in zip(ready, jobs, strict=True):
+            shard.job = job
             shard.submitted += 1
+            if job is None and shard.submitted >= self._options.attempts:
+                shard.given_up = True
+                self._causes[f"shard {shard.number}: {self._unsubmitted}"] = None
 
     def _look(self) -> None:
-        """See which jobs have ended, and how."""
-        for shard in self._waiting:
-            if shard.job is not None and shard.job.done():
+        """See which jobs have ended, and how; a job that leaves no result is seen when the scheduler is asked."""
+        ask = time.monotonic() - self._asked >= _ASK_S
+        for shard in [shard for shard in self._waiting if shard.job is not None]:
+            if shard.job.done(force_check=ask):
                 job, shard.job = shard.job, None
                 self._end(shard, job)
+            if ask:  # which tells the state of all jobs
+                ask, self._asked = False, time.monotonic()
 
     def _end(self, shard: Shard, job: Any) -> None:
         outcome = _outcome_of(job)
@@ -348,6 +361,8 @@ def _parameters(config: EvalConfig, given: Mapping[str, Any]) -> dict[str, Any]:
         parameters["gpus_per_node"] = 1
     for name, value in given.items():
         plain = name.removeprefix("slurm_")
+        if plain in _ONE_TASK and value != 1:
+            raise ConfigError(f"engine argument {name}={value}: a shard is one task on one node; give more shards")
         if name in shared:
             parameters[name] = value
         elif plain in slurm or plain in shared:

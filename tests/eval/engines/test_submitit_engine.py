@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support import fake_slurm
 from support.fakes import SUITE, FakeWorld
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.results import EvalResult, Progress, open_or_begin, resume
@@ -85,6 +86,7 @@ def _modules_for_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
             "unknown argument of engine 'submitit' 'partitoin': did you mean .*partition",
         ),
         ({"shards": 2, "poll_s": 0}, "poll_s must be above 0"),
+        ({"shards": 2, "nodes": 2}, "nodes=2: a shard is one task on one node"),
         ({"shards": 2, "attempts": 0}, "attempts must be at least 1"),
     ],
 )
@@ -192,9 +194,30 @@ def test_a_folder_keeps_its_number_of_shards_and_its_engine(tmp_path: Path) -> N
         )
 
 
+@pytest.mark.heavy
+def test_slurm_gets_an_array_of_jobs_and_one_that_dies_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = fake_slurm.install(tmp_path / "bin")
+    monkeypatch.setenv("PATH", f"{commands}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setattr("vecenv_eval.engines.submitit_engine._ASK_S", 1.0)
+    folder = tmp_path / "run"
+    kill = Signals(folder.resolve() / "shards" / "2-of-2", signal.SIGKILL)
+    arguments = {"executor": "auto", "shards": 2, "poll_s": 0.2, "partition": "gpu", "timeout_min": 60, "mem_gb": 2}
+    result = run(folder, kill, policy=SLOW, num_envs=1, num_threads=2, engine_args=arguments)
+    assert kill.sent_to
+    assert result.ok
+    assert verdicts(result) == verdicts(local(tmp_path / "local", policy=SLOW))
+    array, again = [path.read_text() for path in sorted(commands.glob("sbatch-*.sh"))]
+    for line in ("partition=gpu", "time=60", "mem=2GB", "cpus-per-task=2"):
+        assert f"#SBATCH --{line}\n" in array
+        assert f"#SBATCH --{line}\n" in again
+    assert "#SBATCH --array=0-1" in array
+    assert "--array" not in again
+
+
 DRIVER = """
 import sys
 from pathlib import Path
+from support import fake_slurm
 from support.fakes import FakeWorld
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.results import open_or_begin
