@@ -13,13 +13,14 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import Field, asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import vecenv
 from vecenv.errors import InvalidInput
 from vecenv.util.names import unknown
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
     from pydantic_core import ErrorDetails
 
 ALL = "all"
@@ -28,6 +29,7 @@ STORE_CHOICES = ("jsonl", "sqlite")
 # Policies that know a benchmark's scenes, by the family of suites they are made for.
 SCRIPTED = {"libero": "pick_place", "simpler": "simpler_scripted"}
 _KEY = "setting"
+_Settings = TypeVar("_Settings", bound="DataclassInstance")
 
 
 class ConfigError(InvalidInput):
@@ -172,6 +174,14 @@ class EvalConfig:
         ),
     )
     fail_fast: bool = field(default=False, metadata=_about("Stop at the first batch that raises.", resumable=True))
+    engine: str = field(
+        default="local",
+        metadata=_about("Where episodes run: local, ray (actors) or submitit (Slurm jobs).", resumable=True),
+    )
+    engine_args: Mapping[str, Any] = field(
+        default_factory=dict,
+        metadata=_about("key=value for the engine; repeatable.", flag="engine-arg", resumable=True),
+    )
 
     def __post_init__(self) -> None:
         if self.video not in VIDEO_CHOICES:
@@ -222,16 +232,7 @@ class EvalConfig:
         Raises:
             ConfigError: there is no such field, a value has the wrong type, or the suite is missing.
         """
-        from pydantic import TypeAdapter, ValidationError
-
-        names = [each.name for each in fields(cls)]
-        for name in values:
-            if name not in names:
-                raise ConfigError(unknown("setting", str(name), names))
-        try:
-            return TypeAdapter(cls).validate_python(dict(values))
-        except ValidationError as error:
-            raise ConfigError("; ".join(map(_problem, error.errors()))) from None
+        return from_values(cls, values, "setting")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by field name, with the policy that is run; :meth:`from_dict` reads them back."""
@@ -255,6 +256,29 @@ class EvalConfig:
         if not isinstance(self.episodes, str):
             values["episodes"] = list(self.episodes)
         path.write_text(yaml.safe_dump(values, sort_keys=False))
+
+
+def from_values(cls: type[_Settings], values: Mapping[str, Any], what: str) -> _Settings:
+    """A dataclass from plain values, by field name.
+
+    Args:
+        cls: the dataclass.
+        values: a value for each field that is given.
+        what: what a field is called in messages, such as ``"setting"``.
+
+    Raises:
+        ConfigError: there is no such field, a value has the wrong type, or one is missing.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    names = [each.name for each in fields(cls)]
+    for name in values:
+        if name not in names:
+            raise ConfigError(unknown(what, str(name), names))
+    try:
+        return TypeAdapter(cls).validate_python(dict(values))
+    except ValidationError as error:
+        raise ConfigError("; ".join(map(_problem, error.errors()))) from None
 
 
 def parse_shard(text: str | None) -> tuple[int, int]:

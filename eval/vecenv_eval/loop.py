@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import traceback
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TypeAlias
@@ -20,16 +20,17 @@ import numpy as np
 
 from vecenv.contract import BatchEnv, Control, Metrics
 from vecenv_eval.clocks import EpisodeClocks
-from vecenv_eval.conditions import conditions, stored_as
+from vecenv_eval.conditions import conditions
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.datasets.lerobot import LeRobotWriter
 from vecenv_eval.drive import drive
 from vecenv_eval.environments import Environments, Placed, make_arguments, slots_of
-from vecenv_eval.episodes import Episode, Stream, Suite
+from vecenv_eval.episodes import Episode, Stream, Suite, plan, streams
 from vecenv_eval.policies import Ending, Policy, Refillable, extras_of
 from vecenv_eval.results import Progress, count
 from vecenv_eval.simulator import Simulator
-from vecenv_eval.store import Record, ResultStore, StoreError
+from vecenv_eval.sink import Sink
+from vecenv_eval.store import Record, StoreError
 from vecenv_eval.video.episodes import NONE, EpisodeVideos
 from vecenv_eval.watch import watching
 
@@ -42,6 +43,31 @@ _SHARE_TO_REFILL = {"native": 0.0, "physx_cpu": 0.0}
 _GPU_SHARE = 1 / 16
 
 
+def make_streams(
+    policy: Policy,
+    suite: Suite,
+    tasks: Sequence[int],
+    episodes: Mapping[int, Sequence[int]],
+    *,
+    num_envs: int | None,
+    done: Collection[Episode] = (),
+) -> list[Stream]:
+    """What runs the episodes of tasks but those in ``done``; batches, if the policy cannot begin single slots.
+
+    Args:
+        policy: what runs them.
+        suite: the suite.
+        tasks: task indices.
+        episodes: episode indices by task.
+        num_envs: most episodes that run at once, None for the suite's number.
+        done: episodes to leave out.
+    """
+    most = suite.max_slots if num_envs is None else num_envs
+    if isinstance(policy, Refillable):
+        return streams(suite, tasks, episodes, num_envs=most, done=done)
+    return [Stream.of(b) for b in plan(suite, tasks, episodes, num_envs=most, done=done)]
+
+
 class EpisodeLoop:
     """Runs streams one after the other.
 
@@ -50,7 +76,7 @@ class EpisodeLoop:
         suite: the suite.
         policy: acts for every environment.
         simulator: builds environments.
-        store: the results folder.
+        store: where the records go.
         planned: every episode of the evaluation, those done before included.
         on_progress: called after every call of the policy.
         index: number of this run on the folder, from 0.
@@ -65,7 +91,7 @@ class EpisodeLoop:
         suite: Suite,
         policy: Policy,
         simulator: Simulator,
-        store: ResultStore,
+        store: Sink,
         *,
         planned: Collection[Episode],
         on_progress: Callable[[Progress], None],
@@ -105,10 +131,32 @@ class EpisodeLoop:
         except KeyboardInterrupt:
             return True
         finally:
-            self._environments.close()
-            for watcher in self._watchers:
-                watcher.close()
+            self.close()
         return False
+
+    def run_stream(self, number: int, stream: Stream) -> None:
+        """Run one stream; what an exception leaves of it runs afterwards, unless the config says to stop.
+
+        The environment stays, and is placed anew for the next stream of the same scenes; call :meth:`close` at the end.
+
+        Args:
+            number: what records name it by.
+            stream: what to run.
+
+        Raises:
+            ConfigError: the environment refuses a setting.
+        """
+        rest: Stream | None = stream
+        while rest is not None and len(rest):
+            rest = self._run_safely(number, rest)
+            if rest is not None and self._config.fail_fast:
+                return
+
+    def close(self) -> None:
+        """Close the environment and whatever watches it."""
+        self._environments.close()
+        for watcher in self._watchers:
+            watcher.close()
 
     def _run_all(self, queue: deque[Stream]) -> bool:
         """Run streams until none is left; False when to stop for good."""
@@ -213,7 +261,6 @@ class EpisodeLoop:
             return
         from vecenv_eval.demos.options import make_options
         from vecenv_eval.demos.record import Recorder
-        from vecenv_eval.demos.write import write_demos
 
         options = make_options(self._simulator.make, suite=self._suite.name, **make_arguments(self._config))
         episodes = [slot.episode for slot in running.slots]
@@ -228,7 +275,7 @@ class EpisodeLoop:
                 by_task.setdefault((running.slots[slot].suite, running.slots[slot].task), []).append(slot)
             for key, slots in by_task.items():
                 chosen = [taken[slot] for slot in slots]
-                write_demos(self._store.demos_path(*key), *key, self._suite.instructions[key[1]], chosen)
+                self._store.add_demos(*key, self._suite.instructions[key[1]], chosen)
 
         with recorder.listening():
             yield recorder.begin, finish
@@ -291,8 +338,7 @@ class EpisodeLoop:
         self._progress.count(self._records)
 
     def _write_conditions(self, env: BatchEnv) -> None:
-        ran_under = conditions(env, self._config) | stored_as(self._config, self._store.rows.describe())
-        self._store.write_config({**self._store.config(), "conditions": ran_under})
+        self._store.write_conditions(conditions(env, self._config))
 
 
 class _Running:

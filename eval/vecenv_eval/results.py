@@ -15,6 +15,9 @@ from vecenv_eval.episodes import Episode, Suite
 from vecenv_eval.report import Summary, markdown, summarise
 from vecenv_eval.store import CONFIG, Record, ResultStore, StoreError
 
+# Where ``config.json`` has the policy's name, which is known where the policy is made.
+POLICY_NAME = "policy_name"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
@@ -122,7 +125,10 @@ def resume(folder: Path, **changes: Any) -> tuple[EvalConfig, ResultStore]:
         config = EvalConfig.from_dict(store.config()["config"])
     except (KeyError, TypeError, AttributeError, ConfigError) as error:
         raise StoreError(f"{folder / CONFIG} does not hold an evaluation: {error}") from None
-    return replace(config, **{key: value for key, value in changes.items() if value is not None}), store
+    given = {key: value for key, value in changes.items() if value is not None}
+    if given.get("engine", config.engine) != config.engine:  # another engine takes other arguments
+        given.setdefault("engine_args", {})
+    return replace(config, **given), store
 
 
 def write_results(

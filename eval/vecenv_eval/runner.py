@@ -1,7 +1,7 @@
 """Evaluate a policy on a suite: check the config, run what has no verdict yet, summarise.
 
 An :class:`~vecenv_eval.config.EvalConfig` and a results folder come in; :class:`Evaluation` refuses what cannot run
-before anything is built, plans the batches, runs them (``vecenv_eval.loop``) and returns an
+before anything is built, plans the batches, has an engine run them (``vecenv_eval.engine``) and returns an
 :class:`~vecenv_eval.results.EvalResult`.
 """
 
@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Collection
+from functools import cached_property
 from pathlib import Path
 
 from vecenv import family, protocols
 from vecenv.errors import VecenvError
 from vecenv.placement import episode_indices
 from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy, parse_shard
+from vecenv_eval.engine import EngineError, make_engine
 from vecenv_eval.environments import make_arguments
-from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, shard, streams
-from vecenv_eval.loop import EpisodeLoop
-from vecenv_eval.policies import Closing, Refillable, check_policy, make_policy
+from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, shard
+from vecenv_eval.loop import make_streams
+from vecenv_eval.policies import Closing, Policy, check_policy, make_policy
 from vecenv_eval.provenance import run_conditions
-from vecenv_eval.results import EvalResult, Progress, open_or_begin, write_results
+from vecenv_eval.results import POLICY_NAME, EvalResult, Progress, open_or_begin, write_results
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import RESULTS, ResultStore, default_folder
 
@@ -70,7 +72,21 @@ class Evaluation:
         self.config = config
         self.simulator = simulator or vecenv_simulator()
         self.suite, self.tasks, self.episodes = check(config, self.simulator)
-        self.policy = make_policy(config.policy_name, seed=_policy_seed(config), **config.policy_args)
+        self._engine = make_engine(config)
+        if self._engine.in_process:
+            _ = self.policy  # what it raises is a mistake in the config
+
+    @cached_property
+    def policy(self) -> Policy:
+        """The policy in this process, made when it is first asked for."""
+        return make_policy(self.config.policy_name, seed=self.policy_seed, **self.config.policy_args)
+
+    @property
+    def policy_seed(self) -> int:
+        """The seed of the policy: as given, else the environment's under the protocol, 0 where it has none."""
+        if self.config.seed is not None:
+            return self.config.seed
+        return protocols.protocol(self.config.protocol, family(self.config.suite)).seed or 0
 
     @property
     def planned(self) -> tuple[Episode, ...]:
@@ -79,10 +95,9 @@ class Evaluation:
 
     def streams(self, done: Collection[Episode] = ()) -> list[Stream]:
         """What runs the planned episodes but those in ``done``; batches, if the policy cannot begin single slots."""
-        most = self.suite.max_slots if self.config.num_envs is None else self.config.num_envs
-        if isinstance(self.policy, Refillable):
-            return streams(self.suite, self.tasks, self.episodes, num_envs=most, done=done)
-        return [Stream.of(b) for b in plan(self.suite, self.tasks, self.episodes, num_envs=most, done=done)]
+        return make_streams(
+            self.policy, self.suite, self.tasks, self.episodes, num_envs=self.config.num_envs, done=done
+        )
 
     def run(self, store: ResultStore, on_progress: Callable[[Progress], None] = lambda progress: None) -> EvalResult:
         """Run what the store does not have yet.
@@ -91,6 +106,7 @@ class Evaluation:
 
         Raises:
             ConfigError: the environment refuses a setting; a results folder without episodes is removed.
+            EngineError: the engine cannot run anything.
             StoreError: another process writes to the results folder, or it cannot be written.
         """
         try:
@@ -98,36 +114,23 @@ class Evaluation:
                 return self._run(store, on_progress)
         finally:
             store.close()
-            if isinstance(self.policy, Closing):
+            if self._engine.in_process and isinstance(self.policy, Closing):
                 self.policy.close()
 
     def _run(self, store: ResultStore, on_progress: Callable[[Progress], None]) -> EvalResult:
         content = store.config()
-        store.write_config(
-            {**content, "policy_name": self.policy.name, "runs": [*content.get("runs", []), run_conditions()]}
-        )
-        loop = EpisodeLoop(
-            self.config,
-            self.suite,
-            self.policy,
-            self.simulator,
-            store,
-            planned=self.planned,
-            on_progress=on_progress,
-            index=len(content.get("runs", [])),
-        )
+        runs = content.get("runs", [])
+        name = {POLICY_NAME: self.policy.name} if self._engine.in_process else {}
+        store.write_config({**content, **name, "runs": [*runs, {**run_conditions(), "engine": self.config.engine}]})
         try:
-            interrupted = loop.run(self.streams(store.done()), self._again)
-        except ConfigError:
+            outcome = self._engine.run(self, store, len(runs), on_progress)
+        except (ConfigError, EngineError):
             store.discard()
             raise
+        name = store.config().get(POLICY_NAME) or self.config.policy_name
         return write_results(
-            store, self.suite, self.planned, self.policy.name, interrupted=interrupted, causes=tuple(loop.causes)
+            store, self.suite, self.planned, name, interrupted=outcome.interrupted, causes=outcome.causes
         )
-
-    def _again(self, episodes: Collection[Episode]) -> list[Stream]:
-        """Streams of these episodes alone."""
-        return self.streams(done=frozenset(self.planned) - frozenset(episodes))
 
 
 def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, ...], dict[int, tuple[int, ...]]]:
@@ -142,14 +145,8 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     _check_record(config)
     _check_policy(config)
     check_policy(config.policy_name, **config.policy_args)
+    make_engine(config)
     return suite, tasks, episodes
-
-
-def _policy_seed(config: EvalConfig) -> int:
-    """The seed of the policy: as given, else the environment's under the protocol, 0 where it has none."""
-    if config.seed is not None:
-        return config.seed
-    return protocols.protocol(config.protocol, family(config.suite)).seed or 0
 
 
 def chosen_episodes(config: EvalConfig, suite: Suite) -> tuple[tuple[int, ...], dict[int, tuple[int, ...]]]:

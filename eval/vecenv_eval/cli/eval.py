@@ -154,14 +154,15 @@ def _run_campaign(campaign: Campaign, quiet: bool) -> int:
 
 @contextmanager
 def _user_errors() -> Iterator[None]:
-    """A mistake of the user becomes one line and exit status 2."""
+    """A mistake of the user becomes one line and exit status 2, and so does a cluster that cannot be used."""
+    from vecenv_eval.engine import EngineError
     from vecenv_eval.episodes import SpecError
     from vecenv_eval.policies import PolicyError
     from vecenv_eval.store import StoreError
 
     try:
         yield
-    except (ConfigError, PolicyError, SpecError, StoreError) as error:
+    except (ConfigError, EngineError, PolicyError, SpecError, StoreError) as error:
         fail(" ".join(str(error).split()))
 
 

@@ -1,0 +1,1 @@
+"""The engines (``vecenv_eval.engine`` says what one is): ``local``, ``ray`` and ``submitit``."""
