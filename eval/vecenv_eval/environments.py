@@ -80,10 +80,8 @@ class Environments:
 
     def _make(self, stream: Stream) -> BatchEnv:
         """Build an environment. A value it refuses is the config's fault: no other stream would fare better."""
-        by_task = {t: [slot.episode for slot in stream.first if slot.task == t] for t in stream.tasks}
-        alike = all(episodes == by_task[stream.tasks[0]] for episodes in by_task.values())
-        placed = {"tasks": list(stream.tasks), "episodes": by_task[stream.tasks[0]] if alike else by_task}
-        arguments = {**placed, **make_arguments(self._config)}
+        episodes = {t: [slot.episode for slot in stream.first if slot.task == t] for t in stream.tasks}
+        arguments = {"tasks": list(stream.tasks), "episodes": episodes, **make_arguments(self._config)}
         try:
             return self._simulator.make(stream.suite, **arguments)
         except AssetsMissing as error:
@@ -106,6 +104,8 @@ def make_arguments(config: EvalConfig) -> dict[str, Any]:
                 f"{config.suite}: image size, level of detail and colors are LIBERO's; SIMPLER's are fixed"
             )
         arguments["render"] = {**_render_of(arguments), **wanted}
+    if config.camera_names:
+        given["cameras"] = config.camera_names
     if config.protocol != protocols.DEFAULT:
         given["protocol"] = config.protocol
     return {**arguments, **{name: value for name, value in given.items() if value is not None}}

@@ -66,6 +66,7 @@ class Suite:
         every: how many of them ``"all"`` runs; None for all.
         tasks: name of each task, by which it may be asked for; may be empty.
         max_slots: most episodes to run at once by default.
+        cameras: names of the cameras in the scene of each task; empty where they are not known.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Suite:
     every: int | None = None
     tasks: tuple[str, ...] = ()
     max_slots: int = MAX_SLOTS
+    cameras: tuple[tuple[str, ...], ...] = ()
 
     def episodes_of(self, task: int) -> int:
         """How many episodes of a task can be run."""

@@ -8,17 +8,18 @@ before anything is built, plans the batches, runs them (``vecenv_eval.loop``) an
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 from vecenv import family, protocols
 from vecenv.errors import VecenvError
+from vecenv.observations import UnknownCamera, choose_cameras
 from vecenv.placement import episode_indices
 from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
 from vecenv_eval.loop import EpisodeLoop
-from vecenv_eval.policies import Closing, Refillable, check_policy, make_policy
+from vecenv_eval.policies import Closing, Refillable, Seeing, check_policy, make_policy
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.report import markdown, summarise
 from vecenv_eval.results import EvalResult, Progress, begin
@@ -72,6 +73,8 @@ class Evaluation:
         self.simulator = simulator or vecenv_simulator()
         self.suite, self.tasks, self.episodes = check(config, self.simulator)
         self.policy = make_policy(config.policy_name, seed=_policy_seed(config), **config.policy_args)
+        if isinstance(self.policy, Seeing):
+            _check_cameras_of(self.policy, config, self.suite, self.tasks)
 
     @property
     def planned(self) -> tuple[Episode, ...]:
@@ -149,7 +152,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     suite = simulator.suite(config.suite, config.protocol)
     tasks, episodes = _chosen_episodes(config, suite)
     _check_make(simulator, config)
-    _check_record(config)
+    _check_cameras(config, suite, tasks)
     _check_policy(config)
     check_policy(config.policy_name, **config.policy_args)
     return suite, tasks, episodes
@@ -191,7 +194,32 @@ def _check_policy(config: EvalConfig) -> None:
         raise ConfigError("policy 'voxposer' knows Panda's and WidowX's hands, not the Google Robot's")
 
 
-def _check_record(config: EvalConfig) -> None:
-    """Recordings are LIBERO's HDF5 files: they hold MuJoCo states and begin from LIBERO's init states."""
-    if config.records and family(config.suite) == protocols.SIMPLER:
-        raise ConfigError(f"{config.suite} cannot be recorded: recordings are in LIBERO's layout, for LIBERO's suites")
+def _check_cameras(config: EvalConfig, suite: Suite, tasks: Collection[int]) -> None:
+    """Refuse cameras that the scene of a task does not have."""
+    for task in tasks if config.camera_names and suite.cameras else ():
+        try:
+            choose_cameras(config.camera_names, _cameras_of(config, suite, task))
+        except VecenvError as error:
+            raise ConfigError(f"{suite.name} task {task}: {error}") from None
+
+
+def _check_cameras_of(policy: Seeing, config: EvalConfig, suite: Suite, tasks: Collection[int]) -> None:
+    """Refuse a policy that reads the images of a camera that it would not get."""
+    for task in tasks if suite.cameras else ():
+        there = _cameras_of(config, suite, task)
+        if config.camera_names:
+            there = choose_cameras(config.camera_names, there)
+        for name in policy.needed_cameras():
+            try:
+                choose_cameras([name], there)
+            except UnknownCamera:
+                what = f"policy {config.policy_name!r} reads camera {name!r}"
+                raise ConfigError(f"{what}; {suite.name} task {task} has {', '.join(there)} here") from None
+
+
+def _cameras_of(config: EvalConfig, suite: Suite, task: int) -> tuple[str, ...]:
+    """The cameras of a task's scene, and those that ``--env-arg render=...`` adds."""
+    render = config.env_args.get("render")
+    added = render.get("cameras", ()) if isinstance(render, Mapping) else ()
+    names = [str(each.get("name")) if isinstance(each, Mapping) else str(getattr(each, "name", "")) for each in added]
+    return (*suite.cameras[task], *names)

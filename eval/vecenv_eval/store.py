@@ -56,6 +56,8 @@ class Record:
         policy_s, physics_s, images_s: its share of what its batch spent in the policy, in physics and in rendering.
         extras: what the policy reports about the episode, numbers and texts by name.
         stand_ins: a sentence for each file that was missing and what was used instead.
+        parts: SIMPLER's intermediate results of the success check after the last tick, by upstream's names: true or
+            false, or a number. LIBERO has none.
     """
 
     suite: str
@@ -80,6 +82,7 @@ class Record:
     stand_ins: tuple[str, ...] = ()
     success_first: bool = False
     success_final: bool = False
+    parts: Mapping[str, bool | float] = field(default_factory=dict)
 
     @property
     def verdict(self) -> dict[str, Any]:

@@ -65,10 +65,14 @@ def _text(field: Field[Any]) -> str:
 
 
 def _option_type(hint: Any) -> Any:
-    """What typer reads for a field: of ``str | Sequence[int]`` the text, of a mapping or sequence a list of texts."""
+    """What typer reads for a field: of a mapping or a sequence of texts a list of texts; of ``str | Sequence[int]`` one
+    text, because numbers are written as a specification such as ``0,3,5-7``.
+    """
     if _holds(hint, Mapping):
         return list[str]
     kinds = [kind for kind in _members(hint) if kind is not NoneType]
+    if any(_holds(kind, Sequence) and typing.get_args(kind) == (str,) for kind in kinds):
+        return list[str]
     plain = [kind for kind in kinds if not _holds(kind, Sequence)]
     return plain[0] if plain else list[str]
 

@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 import vecenv
 from vecenv.assets import AssetsMissing
-from vecenv.contract import ACTION_DIM, Control
-from vecenv.libero.env import LiberoEnv
+from vecenv.contract import ACTION_DIM, BatchEnv, Control
 from vecenv_eval.demos.hdf5 import DemoError, Unreadable
 from vecenv_eval.demos.outcomes import Outcome, ReplayReport
-from vecenv_eval.demos.record import flat_state
+from vecenv_eval.demos.record import flat_state, second_halves
 from vecenv_eval.demos.schema import Demo, MadeStart, StoredStart
 
 NO_FIXTURES = "no model_file: fixtures at their centres"
@@ -98,7 +97,7 @@ def _start_key(start: StoredStart | MadeStart) -> Hashable:
     return None if start.fixtures is None else frozenset(start.fixtures)
 
 
-def _make(demos: Sequence[Demo], config: ReplayConfig) -> LiberoEnv:
+def _make(demos: Sequence[Demo], config: ReplayConfig) -> BatchEnv:
     """The environment with one slot a demonstration, reset and in the start states."""
     stored = [demo.start for demo in demos if isinstance(demo.start, StoredStart)]
     made = [demo.start for demo in demos if isinstance(demo.start, MadeStart)]  # one list is empty: see _start_key
@@ -111,7 +110,6 @@ def _make(demos: Sequence[Demo], config: ReplayConfig) -> LiberoEnv:
         if getattr(config, name) is not None:
             options[name] = getattr(config, name)
     env = vecenv.make(demos[0].suite, tasks=list(episodes), episodes=episodes, **options)
-    assert isinstance(env, LiberoEnv)  # demonstrations are of LIBERO's suites
     try:
         env.reset()
         if stored:
@@ -133,14 +131,14 @@ def _stored_options(starts: Sequence[StoredStart]) -> dict[str, Any]:
     return options
 
 
-def _load(env: LiberoEnv, starts: Sequence[StoredStart]) -> None:
+def _load(env: BatchEnv, starts: Sequence[StoredStart]) -> None:
     """Put each slot into its stored state; the controller keeps its memory of the reset, as upstream's does."""
     state = env.state()
     qpos, qvel, time = state.qpos.copy(), state.qvel.copy(), state.time.copy()
     for slot, start in enumerate(starts):
         nq, nv = state.nq[slot], state.nv[slot]
         time[slot], qpos[slot, :nq], qvel[slot, :nv] = start.state[0], start.state[1 : 1 + nq], start.state[1 + nq :]
-    env.set_state(qpos=qpos, qvel=qvel, time=time)
+    env.set_state(replace(state, qpos=qpos, qvel=qvel, time=time))
 
 
 # -- stepping ----------------------------------------------------------------------------------------------------------
@@ -154,7 +152,7 @@ def _replay_batch(demos: Sequence[Demo], config: ReplayConfig) -> list[Outcome]:
         env.close()
 
 
-def _step_through(env: LiberoEnv, demos: Sequence[Demo]) -> list[Outcome]:
+def _step_through(env: BatchEnv, demos: Sequence[Demo]) -> list[Outcome]:
     """Step until every demonstration has been judged; one that has ended idles beside the others."""
     lengths = np.array([len(demo) for demo in demos])
     outcomes: list[Outcome | None] = [None] * len(demos)
@@ -165,6 +163,7 @@ def _step_through(env: LiberoEnv, demos: Sequence[Demo]) -> list[Outcome]:
         if not waiting.any():
             break
         before |= _states(env, waiting & (lengths == tick + 1))
+        _begin_second_halves(env, demos, tick)
         control = env.step_continuous(_actions(demos, tick))
         judged = waiting & (control.done | (lengths == tick + 1))
         for slot, after in _states(env, judged).items():
@@ -172,7 +171,18 @@ def _step_through(env: LiberoEnv, demos: Sequence[Demo]) -> list[Outcome]:
     return [outcome for outcome in outcomes if outcome is not None]
 
 
-def _states(env: LiberoEnv, chosen: np.ndarray) -> dict[int, np.ndarray]:
+def _begin_second_halves(env: BatchEnv, demos: Sequence[Demo], tick: int) -> None:
+    """Begin the second half of a SIMPLER task at the tick at which it began on record."""
+    begins = [demo.second_half is not None and tick < len(demo) and bool(demo.second_half[tick]) for demo in demos]
+    begun = second_halves(env) if any(begins) else None
+    if begun is not None and (begins & ~begun).any():
+        from vecenv.simpler.env import SimplerEnv
+
+        assert isinstance(env, SimplerEnv)  # only its tasks have halves
+        env.advance_subtask(begins & ~begun)
+
+
+def _states(env: BatchEnv, chosen: np.ndarray) -> dict[int, np.ndarray]:
     if not chosen.any():
         return {}
     state = env.state()

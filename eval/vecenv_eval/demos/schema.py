@@ -54,6 +54,7 @@ class Demo:
         start: where it begins.
         actions: float64 [T, 7], finite.
         success: the verdict on record, None where there is none.
+        second_half: of a SIMPLER task in two halves, whether each action belongs to the second, bool [T]; else None.
     """
 
     path: Path
@@ -63,6 +64,7 @@ class Demo:
     start: StoredStart | MadeStart
     actions: np.ndarray
     success: bool | None
+    second_half: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -93,7 +95,11 @@ class Recording:
         actions: what was executed, [T, 7].
         init_state, final_state: before the first and after the last action, [1 + nq + nv].
         states: before each action, [T, 1 + nq + nv], or None.
+        second_half: of a SIMPLER task in two halves, whether each action belongs to the second, bool [T]; None where
+            none does.
         options: keyword arguments of ``vecenv.make``, see ``make_options``; plain JSON types.
+        instruction: what the policy was told.
+        labels: what else identifies the episode, such as its protocol; for readers.
     """
 
     episode: int
@@ -103,4 +109,7 @@ class Recording:
     init_state: np.ndarray
     final_state: np.ndarray
     states: np.ndarray | None = None
+    second_half: np.ndarray | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    instruction: str = ""
+    labels: Mapping[str, str | int] = field(default_factory=dict)
