@@ -96,19 +96,28 @@ def make_arguments(config: EvalConfig) -> dict[str, Any]:
     given: dict[str, Any] = {"max_steps": config.max_steps}
     if family(config.suite) == protocols.LIBERO:  # SIMPLER's episodes depend on their number alone
         given["seed"] = config.seed
-    images = {"height": config.image_size, "width": config.image_size, "lod": config.lod, "colors": config.colors}
-    wanted = {name: value for name, value in images.items() if value is not None}
-    if wanted:
-        if family(config.suite) != protocols.LIBERO:
-            raise ConfigError(
-                f"{config.suite}: image size, level of detail and colors are LIBERO's; SIMPLER's are fixed"
-            )
-        arguments["render"] = {**_render_of(arguments), **wanted}
-    if config.camera_names:
-        given["cameras"] = config.camera_names
+    given |= image_arguments(config)
     if config.protocol != protocols.DEFAULT:
         given["protocol"] = config.protocol
     return {**arguments, **{name: value for name, value in given.items() if value is not None}}
+
+
+def image_arguments(config: EvalConfig) -> dict[str, Any]:
+    """Keyword arguments of ``make`` that decide images: ``render`` and ``cameras``, as far as they are given.
+
+    Raises:
+        ConfigError: SIMPLER's images do not have the option.
+    """
+    images = {"height": config.image_size, "width": config.image_size, "lod": config.lod, "colors": config.colors}
+    wanted = {name: value for name, value in images.items() if value is not None}
+    arguments: dict[str, Any] = {"cameras": config.camera_names} if config.camera_names else {}
+    if not wanted:
+        return arguments
+    if family(config.suite) != protocols.LIBERO:
+        given = [option for option in ("image_size", "lod", "colors") if getattr(config, option) is not None]
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise ConfigError(f"{config.suite} does not take {options}: SIMPLER's images are fixed")
+    return {**arguments, "render": {**_render_of(config.env_args), **wanted}}
 
 
 def _render_of(arguments: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -153,9 +153,9 @@ class EpisodeLoop:
             nonlocal ended
             rows = running.slots_to_refill(done, self._refill_share)
             if len(rows):
-                ended += int(env.evaluate().num_steps[rows].sum())
+                ended += int(env.evaluate().num_steps[done].sum())
                 began = clocks.now()
-                running.refill(rows)
+                running.refill(rows, done)
                 assert isinstance(self._policy, Refillable)
                 self._policy.reset_slots(env, running.info, rows)
                 self._begin_recording(running, rows.tolist())
@@ -277,8 +277,8 @@ class _Running:
         enough = len(rows) >= share * len(done) or done.all()
         return np.array(rows if enough else [], int)
 
-    def refill(self, rows: np.ndarray) -> None:
-        """Place the next episode of their scene in finished slots, and reset them."""
+    def refill(self, rows: np.ndarray, done: np.ndarray) -> None:
+        """Place the next episode of their scene in slots, and reset them; other slots that are done stay so."""
         for row in rows.tolist():
             self.slots[row] = self._waiting[self._suite.scenes[self.slots[row].task]].popleft()
         chosen = [self.slots[row] for row in rows.tolist()]
@@ -286,6 +286,8 @@ class _Running:
         env.set_episodes(tasks=[e.task for e in chosen], episodes=[e.episode for e in chosen], slots=rows)
         self.info = env.reset()
         slots_of(self.info, self.slots)
+        # A reset begins the episodes of all finished slots again, of those too for which nothing waits.
+        env.end_episodes(np.setdiff1d(np.flatnonzero(done), rows))
 
     def rest(self, num_slots: int) -> Stream:
         """The episodes that have not begun, for as many slots."""

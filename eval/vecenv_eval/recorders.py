@@ -6,6 +6,8 @@ what has a verdict does not run again, so whatever is to be kept of an episode i
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import Suite
@@ -29,12 +31,18 @@ def make_recorders(config: EvalConfig, suite: Suite, simulator: Simulator, store
 
         options = make_options(simulator.make, suite=suite.name, **make_arguments(config))
         recorders.append(DemoRecorder(store.demos_path, suite.instructions, options, states=config.record_states))
+    return [*recorders, *image_recorders(config, store.folder)]
+
+
+def image_recorders(config: EvalConfig, folder: Path) -> list[EpisodeRecorder]:
+    """The recorders that render: a LeRobot dataset and videos, in a results folder; errors as of `make_recorders`."""
+    recorders: list[EpisodeRecorder] = []
     if config.record_lerobot:
         from vecenv_eval.datasets.lerobot import LeRobotWriter, image_keys
 
-        recorders.append(LeRobotWriter(store.folder / "lerobot", image_keys(config.camera_names)))
+        recorders.append(LeRobotWriter(folder / "lerobot", image_keys(config.camera_names)))
     if config.video != NONE:
         from vecenv_eval.video.episodes import CAMERAS, EpisodeVideos
 
-        recorders.append(EpisodeVideos(store.folder, config.video, config.camera_names or CAMERAS))
+        recorders.append(EpisodeVideos(folder, config.video, config.camera_names or CAMERAS))
     return recorders

@@ -152,7 +152,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     suite = simulator.suite(config.suite, config.protocol)
     tasks, episodes = _chosen_episodes(config, suite)
     _check_make(simulator, config)
-    _check_cameras(config, suite, tasks)
+    check_cameras(config, suite, tasks)
     _check_policy(config)
     check_policy(config.policy_name, **config.policy_args)
     return suite, tasks, episodes
@@ -194,8 +194,12 @@ def _check_policy(config: EvalConfig) -> None:
         raise ConfigError("policy 'voxposer' knows Panda's and WidowX's hands, not the Google Robot's")
 
 
-def _check_cameras(config: EvalConfig, suite: Suite, tasks: Collection[int]) -> None:
-    """Refuse cameras that the scene of a task does not have."""
+def check_cameras(config: EvalConfig, suite: Suite, tasks: Collection[int]) -> None:
+    """Refuse cameras that the scene of a task does not have.
+
+    Raises:
+        ConfigError: there is no such camera; the message names it and those that there are.
+    """
     for task in tasks if config.camera_names and suite.cameras else ():
         try:
             choose_cameras(config.camera_names, _cameras_of(config, suite, task))

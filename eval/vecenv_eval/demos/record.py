@@ -77,12 +77,12 @@ class DemoRecorder:
         self._rollouts |= {slot: _Rollout(flat_state(state, slot)) for slot in episodes}
 
     def observe(self, env: object, slots: Sequence[int], actions: np.ndarray) -> None:
-        """Note one tick of each slot, before it happens."""
+        """Note one tick of each slot, before it happens; slots whose beginning was not seen are passed over."""
         del env  # what is shared with other recorders has images, and no states
         assert self._env is not None, "call begin() first"
         state = self._env.state() if self._with_states else None
         halves = second_halves(self._env)
-        for slot in slots:
+        for slot in self._rollouts.keys() & set(slots):
             rollout = self._rollouts[slot]
             rollout.actions.append(np.array(actions[slot], float))
             if state is not None:

@@ -8,8 +8,8 @@ stepped tick by tick with their own actions, and judged at or before their own l
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,18 @@ import numpy as np
 import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.contract import ACTION_DIM, BatchEnv, Control
+from vecenv_eval.demos.files import ReplayError
 from vecenv_eval.demos.hdf5 import DemoError, Unreadable
 from vecenv_eval.demos.outcomes import Outcome, ReplayReport
 from vecenv_eval.demos.record import flat_state, second_halves
 from vecenv_eval.demos.schema import Demo, MadeStart, StoredStart
+from vecenv_eval.store import Record
+from vecenv_eval.watch import EpisodeRecorder, watching
 
 NO_FIXTURES = "no model_file: fixtures at their centres"
+# Options of ``vecenv.make`` that the demonstrations themselves decide.
+_NOT_REPLACED = frozenset({"tasks", "episodes", "max_steps", "gripper"})
+_NOT_REPLACED_BECAUSE = "a demonstration decides which episode it is, how long it is, and how its gripper is commanded"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +37,7 @@ class ReplayConfig:
 
     Attributes:
         backend: physics backend; None for the one on record, ``native`` where there is none.
+        options: further options of ``vecenv.make``, in place of those on record.
         num_envs: most demonstrations that run at once.
         num_threads: threads of the physics, None for the backend's own choice.
         contacts: ``"published"`` or ``"current"``; None for those on record, published where there are none.
@@ -38,8 +45,31 @@ class ReplayConfig:
 
     backend: str | None = None
     contacts: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
     num_envs: int = 256
     num_threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in _NOT_REPLACED & self.options.keys():
+            raise ReplayError(f"option {name}={self.options[name]!r}: {_NOT_REPLACED_BECAUSE}")
+
+    @property
+    def replacing(self) -> dict[str, Any]:
+        """The options that hold in place of those on record.
+
+        Raises:
+            OptionError: see ``check_suite``.
+        """
+        own = {name: getattr(self, name) for name in ("backend", "contacts", "num_threads")}
+        return {**self.options, **{name: value for name, value in own.items() if value is not None}}
+
+    def check_suite(self, suite: str) -> None:
+        """Refuse options that demonstrations of a suite cannot be replayed with.
+
+        Raises:
+            OptionError: the suite does not have the option, or not this value; other ``VecenvError`` likewise.
+        """
+        vecenv.make_config(suite, self.replacing)
 
 
 def replay(
@@ -47,6 +77,7 @@ def replay(
     config: ReplayConfig | None = None,
     *,
     on_batch: Callable[[str], None] = lambda text: None,
+    recorders: Sequence[EpisodeRecorder] = (),
 ) -> ReplayReport:
     """Execute demonstrations again, in as few batches as their starts allow.
 
@@ -54,6 +85,7 @@ def replay(
         demos: what to replay.
         config: how.
         on_batch: called with one line about each batch, before it runs.
+        recorders: see the demonstrations as episodes that run; whoever made them closes them.
 
     Returns:
         Outcomes in the order of ``demos``. What the simulator refuses to place is a problem of that batch alone.
@@ -67,7 +99,7 @@ def replay(
         on_batch(f"batch {number}/{len(batches)}: {len(batch)} demonstrations of up to {longest} ticks")
         chosen = [demos[i] for i in batch]
         try:
-            outcomes.update(zip(batch, _replay_batch(chosen, config), strict=True))
+            outcomes.update(zip(batch, _replay_batch(chosen, config, recorders), strict=True))
         except AssetsMissing:
             raise
         except (ValueError, KeyError, IndexError, TypeError, RuntimeError) as error:
@@ -105,10 +137,7 @@ def _make(demos: Sequence[Demo], config: ReplayConfig) -> BatchEnv:
     episodes: dict[int, list[int]] = {}
     for demo in demos:
         episodes.setdefault(demo.task, []).append(demo.start.episode if isinstance(demo.start, MadeStart) else 0)
-    options |= {"max_steps": max(map(len, demos)), "num_threads": config.num_threads}
-    for name in ("backend", "contacts"):
-        if getattr(config, name) is not None:
-            options[name] = getattr(config, name)
+    options |= {**config.replacing, "max_steps": max(map(len, demos))}
     env = vecenv.make(demos[0].suite, tasks=list(episodes), episodes=episodes, **options)
     try:
         env.reset()
@@ -144,16 +173,19 @@ def _load(env: BatchEnv, starts: Sequence[StoredStart]) -> None:
 # -- stepping ----------------------------------------------------------------------------------------------------------
 
 
-def _replay_batch(demos: Sequence[Demo], config: ReplayConfig) -> list[Outcome]:
+def _replay_batch(demos: Sequence[Demo], config: ReplayConfig, recorders: Sequence[EpisodeRecorder]) -> list[Outcome]:
     env = _make(demos, config)
     try:
-        return _step_through(env, demos)
+        for recorder in recorders:
+            recorder.begin(env, {slot: demo.key for slot, demo in enumerate(demos)})
+        with watching(env, recorders):
+            return _step_through(env, demos, recorders)
     finally:
         env.close()
 
 
-def _step_through(env: BatchEnv, demos: Sequence[Demo]) -> list[Outcome]:
-    """Step until every demonstration has been judged; one that has ended idles beside the others."""
+def _step_through(env: BatchEnv, demos: Sequence[Demo], recorders: Sequence[EpisodeRecorder]) -> list[Outcome]:
+    """Step until every demonstration has been judged; a slot that was judged does not move any more."""
     lengths = np.array([len(demo) for demo in demos])
     outcomes: list[Outcome | None] = [None] * len(demos)
     nq = env.state().nq
@@ -168,6 +200,11 @@ def _step_through(env: BatchEnv, demos: Sequence[Demo]) -> list[Outcome]:
         judged = waiting & (control.done | (lengths == tick + 1))
         for slot, after in _states(env, judged).items():
             outcomes[slot] = _outcome(demos[slot], control, slot, nq[slot], before.pop(slot, None), after)
+        if judged.any():
+            records = {slot: _record(env, demos[slot], control, slot) for slot in np.flatnonzero(judged).tolist()}
+            for recorder in recorders:
+                recorder.finish(env, records)
+            env.end_episodes(judged)
     return [outcome for outcome in outcomes if outcome is not None]
 
 
@@ -222,6 +259,24 @@ def _outcome(demo: Demo, control: Control, slot: int, nq: int, before: np.ndarra
         qvel_error=None if difference is None else float(difference[1 + nq :].max()),
         fault=control.info["fault"][slot],
         note="; ".join(notes),
+    )
+
+
+def _record(env: BatchEnv, demo: Demo, control: Control, slot: int) -> Record:
+    """How the demonstration in a slot went, for recorders."""
+    metrics = env.evaluate()
+    return Record(
+        suite=demo.suite,
+        task=demo.task,
+        episode=demo.number,
+        instruction=env.instructions()[slot],
+        success=bool(control.success[slot]),
+        success_first=bool(metrics.success_first[slot]),
+        success_final=bool(metrics.success_final[slot]),
+        num_steps=int(control.step_index[slot]),
+        reward=float(metrics.cumulative_reward[slot]),
+        fault=control.info["fault"][slot],
+        parts=dict(control.info["parts"][slot]) if "parts" in control.info else {},
     )
 
 

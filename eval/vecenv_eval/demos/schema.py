@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 
 from vecenv_eval.demos.hdf5 import Errors, Opened, member, require_finite, states_dataset, vector_attribute
+from vecenv_eval.episodes import Episode
 
 SUFFIXES = (".hdf5", ".h5")
 
@@ -68,6 +69,18 @@ class Demo:
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    @property
+    def number(self) -> int:
+        """The episode on record; else the demonstration's number in its file."""
+        if isinstance(self.start, MadeStart):
+            return self.start.episode
+        return int("".join(filter(str.isdecimal, self.name)))
+
+    @property
+    def key(self) -> Episode:
+        """Which episode it is."""
+        return Episode(self.suite, self.task, self.number)
 
     def recorded_state(self, ticks: int) -> np.ndarray | None:
         """The state on record after so many ticks: time, qpos, qvel, [1 + nq + nv]; None where there is none.

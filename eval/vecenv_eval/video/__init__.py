@@ -1,4 +1,5 @@
 """Videos of batches: images tiled into frames, frames written to an mp4, and the command ``vecenv video``."""
 
-# Default options of LIBERO's videos; here so that the command's help needs no simulator.
-SIZE, LOD, MAX_STEPS = 256, "exact", 400
+# Step budget of LIBERO's videos, control ticks, and most episodes of one; here so that the command's help needs no
+# simulator.
+MAX_STEPS, MOST_EPISODES = 400, 100

@@ -1,59 +1,72 @@
-"""``vecenv video``: a policy runs one batch of episodes, recorded in one mp4.
+"""``vecenv video``: a policy runs some episodes side by side, recorded in one mp4.
 
-In: a suite, a task, a policy. Out: the file and a line that says how many episodes were solved. The exit status is 2
-when the arguments are wrong and 1 when images cannot be rendered or written.
+The settings of ``vecenv eval`` that say what runs come in, as options or from a YAML file. Out: the file and a line
+that says how many episodes were solved. The exit status is 2 when the arguments are wrong and 1 when images cannot be
+rendered or written, or the policy cannot go on.
 """
 
 from __future__ import annotations
 
+import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import typer
 
-from vecenv_eval.video import LOD, MAX_STEPS, SIZE
+from vecenv.cli import fail
+from vecenv_eval.cli.options import some_settings, user_errors, with_settings
+from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.video import MAX_STEPS
+
+SETTINGS = (
+    *("suite", "policy", "tasks", "episodes", "policy_args", "protocol", "backend", "max_steps", "seed"),
+    *("image_size", "lod", "colors", "cameras", "env_args", "num_threads"),
+)
+_ALSO = {"tasks": "--task", "image_size": "--size", "cameras": "--camera"}
+# One task's first episode, unless others are asked for.
+_USUAL = {"tasks": "0", "episodes": "1"}
+_SHOWN = {
+    **_USUAL,
+    "max_steps": f"{MAX_STEPS} in LIBERO without --protocol; else the protocol's",
+    "cameras": "agentview",
+}
+_HELPS = {
+    "suite": "Suite; `vecenv list` names them.",
+    "cameras": "Cameras that the video shows, side by side; repeatable, or a,b.",
+}
 
 
+@partial(with_settings, names=SETTINGS, also=_ALSO, shown=_SHOWN, helps=_HELPS)
 def video_command(
-    suite: str = typer.Option(..., help="Suite; `vecenv list` names them."),
-    task: str = typer.Option("0", help="Task, by index or name."),
-    episodes: int = typer.Option(1, min=1, max=50, help="How many episodes, from the first; all in one image."),
-    policy: str | None = typer.Option(
-        None,
-        help="random, zero, pick_place (LIBERO), simpler_scripted, or your own module:Class.",
-        show_default="the suite's scripted one",
-    ),
-    max_steps: int | None = typer.Option(
-        None, min=1, help="Step budget of an episode.", show_default=f"{MAX_STEPS}; SIMPLER: the task's"
-    ),
-    camera: list[str] = typer.Option(["agentview"], help="A camera; repeatable, side by side."),
-    size: int | None = typer.Option(
-        None, min=16, help="LIBERO: height and width of an image, pixels.", show_default=str(SIZE)
-    ),
-    lod: str | None = typer.Option(
-        None, help="LIBERO: exact, original (all triangles) or fast (simplified meshes).", show_default=LOD
+    config: Path | None = typer.Option(
+        None, help="YAML file of settings, by the names of EvalConfig's fields; options override it."
     ),
     out: Path = typer.Option(Path("video.mp4"), help="The file to write."),
+    **settings: Any,
 ) -> None:
-    """Record a policy: all episodes of a batch in one mp4, titled, framed by verdict."""
-    from vecenv.cli import fail
-    from vecenv.libero.render.gl import GlError
-    from vecenv.libero.render.options import RenderError
-    from vecenv.observations import ImagesUnavailable
-    from vecenv_eval.config import default_policy
-    from vecenv_eval.policies import PolicyError, make_policy
-    from vecenv_eval.video.rollout import make_env, record_rollout
+    """Record a policy: some episodes side by side in one mp4, titled, framed by verdict."""
+    sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
+    with user_errors():
+        given = {**_USUAL, **some_settings(settings, config, SETTINGS, "video")}
+        if out.suffix != ".mp4":
+            fail(f"--out {out}: videos are written as .mp4")
+        if not given.get("suite"):
+            fail("--suite is needed; `vecenv list` names the suites")
+        from vecenv_eval.video.rollout import record_config
 
-    options = {"max_steps": max_steps, "size": size, "lod": lod}
-    try:
-        chosen = make_policy(policy or default_policy(suite))
-        env = make_env(suite, task, episodes, {name: value for name, value in options.items() if value is not None})
-    except (PolicyError, ValueError, LookupError) as error:
-        fail(str(error))
-    try:
-        frames = record_rollout(env, chosen, out, camera)
-        solved = int(env.evaluate().success.sum())
-    except (GlError, RenderError, ImagesUnavailable, KeyError) as error:
-        fail(str(error), code=1)
-    finally:
-        env.close()
-    typer.echo(f"{out}: {frames} frames, {solved} of {episodes} episodes solved")
+        frames, solved, count = record_config(_with_budget(EvalConfig.from_dict(given), "protocol" in given), out)
+    typer.echo(f"{out}: {frames} frames, {solved} of {count} episodes solved")
+
+
+def _with_budget(config: EvalConfig, protocol_given: bool) -> EvalConfig:
+    """The config with the step budget of a video, where neither it nor a protocol says another."""
+    from dataclasses import replace
+
+    import vecenv
+
+    if len(config.suites) != 1:
+        raise ConfigError(f"--suite {config.suite}: a video shows one suite")
+    if config.max_steps is None and not protocol_given and vecenv.family(config.suite) == "libero":
+        return replace(config, max_steps=MAX_STEPS)
+    return config

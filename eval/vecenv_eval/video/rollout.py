@@ -1,26 +1,68 @@
-"""A policy runs one batch of episodes, and what its cameras see is written to one mp4.
+"""A policy runs some episodes side by side, and what its cameras see is written to one mp4.
 
-In: an environment and a policy, or the names of a suite and a task. Out: the file. LIBERO's images have the size and
-level of detail that are requested; SIMPLER's are as large as its camera's, and its videos run at its robots' 5 or 3
-control steps per second.
+In: a config, of which the episodes run at once; or an environment and a policy. Out: the file. LIBERO's images have the
+size and level of detail that are requested; SIMPLER's are as large as its camera's, and its videos run at its robots' 5
+or 3 control steps per second.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
-import vecenv
-from vecenv.contract import BatchEnv, Control
-from vecenv.libero.render.options import RenderConfig
-from vecenv_eval.policies import Policy
-from vecenv_eval.video import LOD, MAX_STEPS, SIZE
-from vecenv_eval.video.writer import CONTROL_HZ, Recordable, recording
+from vecenv.contract import BatchEnv
+from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.drive import drive
+from vecenv_eval.environments import Environments
+from vecenv_eval.episodes import Stream
+from vecenv_eval.policies import Closing, Policy
+from vecenv_eval.runner import Evaluation, check_cameras
+from vecenv_eval.video import MOST_EPISODES
+from vecenv_eval.video.writer import Recordable, recording
 
 
 class RecordableEnv(BatchEnv, Recordable, Protocol):
     """An environment that a policy can run and ``recording`` can watch."""
+
+
+def record_config(config: EvalConfig, out: Path) -> tuple[int, int, int]:
+    """Run the episodes of a config side by side and record them.
+
+    Args:
+        config: what runs; one suite. Its cameras are those that the video shows; the policy gets all.
+        out: the mp4.
+
+    Returns:
+        Frames written, episodes solved, and episodes.
+
+    Raises:
+        ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
+        GlError, RenderError: images cannot be rendered or written.
+        PolicyStuck: the policy takes no steps.
+    """
+    everywhere = replace(config, cameras=None)
+    evaluation = Evaluation(everywhere)
+    check_cameras(config, evaluation.suite, evaluation.tasks)
+    planned = evaluation.planned
+    try:
+        if len(planned) > MOST_EPISODES:
+            raise ConfigError(
+                f"{len(planned)} episodes are more than the {MOST_EPISODES} that a video shows: choose some with "
+                "--tasks and --episodes"
+            )
+        environments = Environments(evaluation.simulator, evaluation.suite, everywhere, on_make=lambda env: None)
+        try:
+            env = environments.place(Stream(evaluation.suite.name, planned)).env
+            cameras = config.camera_names or ("agentview",)
+            frames = record_rollout(cast("RecordableEnv", env), evaluation.policy, out, cameras)
+            return frames, int(env.evaluate().success.sum()), len(planned)
+        finally:
+            environments.close()
+    finally:
+        if isinstance(evaluation.policy, Closing):
+            evaluation.policy.close()
 
 
 def record_rollout(env: RecordableEnv, policy: Policy, out: Path, cameras: Sequence[str]) -> int:
@@ -34,38 +76,12 @@ def record_rollout(env: RecordableEnv, policy: Policy, out: Path, cameras: Seque
 
     Returns:
         The number of frames written: one per control step, and one that shows the end.
-    """
-    policy.reset(env, env.reset())
-    robot = getattr(env, "robot", None)  # SIMPLER's environments have one
-    rate = CONTROL_HZ if robot is None else robot.control_hz
-    with recording(env, out, cameras=cameras, fps=rate) as video:
-        done = False
-        while not done:
-            acted = policy.act(env)
-            control = acted if isinstance(acted, Control) else env.step_continuous(acted)
-            done = bool(control.done.all())
-    return video.frames
-
-
-def make_env(suite: str, task: str, episodes: int, options: Mapping[str, Any]) -> RecordableEnv:
-    """The batch to record.
-
-    Args:
-        suite: its name.
-        task: index or name.
-        episodes: how many, from the first.
-        options: ``max_steps``, ``size`` and ``lod``, those that were given.
 
     Raises:
-        ValueError, LookupError: a name does not exist, or the suite does not have the option.
+        PolicyStuck: the policy takes no steps.
     """
-    chosen, more = int(task) if task.isdecimal() else task, dict(options)
-    if suite.split("/")[0] == "simpler":
-        given = [f"--{name}" for name in ("size", "lod") if name in more]
-        if given:
-            raise ValueError(f"{' and '.join(given)}: SIMPLER's images are as large and as detailed as upstream's")
-    else:
-        size = more.pop("size", SIZE)
-        more["render"] = RenderConfig(height=size, width=size, lod=more.pop("lod", LOD))
-        more.setdefault("max_steps", MAX_STEPS)
-    return cast("RecordableEnv", vecenv.make(suite, task=chosen, episodes=range(episodes), **more))
+    policy.reset(env, env.reset())
+    with recording(env, out, cameras=cameras, fps=env.control_hz) as video:
+        for _ in drive(env, policy):
+            pass
+    return video.frames
