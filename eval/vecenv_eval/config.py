@@ -157,7 +157,7 @@ class EvalConfig:
     record_lerobot: bool = field(
         default=False, metadata=_about("Write the run as a LeRobot dataset into DIR/lerobot.", resumable=True)
     )
-    fail_fast: bool = field(default=False, metadata=_about("Stop at the first batch that raises.", resumable=True))
+    fail_fast: bool = field(default=False, metadata=_about("Stop when an error ends episodes.", resumable=True))
 
     def __post_init__(self) -> None:
         if self.video not in VIDEO_CHOICES:

@@ -1,4 +1,4 @@
-"""The environment that runs the batches: built once, re-placed while scenes stay the same, closed at the end.
+"""The environment that runs streams of episodes: built once, re-placed while scenes stay the same, closed at the end.
 
 A :class:`~vecenv_eval.episodes.Stream` comes in; :class:`Placed` goes out: its first episodes after their reset, and
 which of them is in each slot.
@@ -91,7 +91,7 @@ class Environments:
 
 
 def make_arguments(config: EvalConfig) -> dict[str, Any]:
-    """Keyword arguments of ``make`` for every batch, without tasks and episodes."""
+    """Keyword arguments of ``make`` for every stream, without tasks and episodes."""
     arguments = {"backend": config.backend, "num_threads": config.num_threads, **config.env_args}
     given: dict[str, Any] = {"max_steps": config.max_steps}
     if family(config.suite) == protocols.LIBERO:  # SIMPLER's episodes depend on their number alone

@@ -1,7 +1,8 @@
-"""Which episodes an evaluation runs, and in which batches.
+"""Which episodes an evaluation runs, and in which streams.
 
-Specifications as a person writes them (``"0,3,5-7"``) come in; out go :class:`Batch` objects: rectangles of tasks times
-episodes, at most ``num_envs`` slots each, tasks that share a scene side by side, without what has already been done.
+Specifications as a person writes them (``"0,3,5-7"``) come in; out go :class:`Stream` objects, without what has already
+been done: at most ``num_envs`` slots each, in which an episode follows when one ends. For policies that cannot begin
+single slots there are :class:`Batch` objects, rectangles of tasks times episodes, which nothing follows.
 """
 
 from __future__ import annotations

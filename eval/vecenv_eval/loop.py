@@ -222,7 +222,7 @@ class EpisodeLoop:
     def _write_errors(self, number: int, episodes: Sequence[Episode], error: Exception) -> None:
         cause = f"{type(error).__name__}: {error}".splitlines()[0]
         self.causes[cause] = None
-        self._store.log_error(f"run {self._index} batch {number} ({len(episodes)} episodes)\n{traceback.format_exc()}")
+        self._store.log_error(f"run {self._index} stream {number} ({len(episodes)} episodes)\n{traceback.format_exc()}")
         failed = [
             Record(
                 suite=episode.suite,

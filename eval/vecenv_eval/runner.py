@@ -1,7 +1,7 @@
 """Evaluate a policy on a suite: check the config, run what has no verdict yet, summarise.
 
 An :class:`~vecenv_eval.config.EvalConfig` and a results folder come in; :class:`Evaluation` refuses what cannot run
-before anything is built, plans the batches, runs them (``vecenv_eval.loop``) and returns an
+before anything is built, plans the streams of episodes, runs them (``vecenv_eval.loop``) and returns an
 :class:`~vecenv_eval.results.EvalResult`.
 """
 
@@ -82,7 +82,10 @@ class Evaluation:
         return tuple(Episode(self.suite.name, task, e) for task in self.tasks for e in self.episodes[task])
 
     def streams(self, done: Collection[Episode] = ()) -> list[Stream]:
-        """What runs the planned episodes but those in ``done``; batches, if the policy cannot begin single slots."""
+        """What runs the planned episodes but those in ``done``.
+
+        Nothing follows in a slot if the policy cannot begin single slots.
+        """
         most = self.suite.max_slots if self.config.num_envs is None else self.config.num_envs
         if isinstance(self.policy, Refillable):
             return streams(self.suite, self.tasks, self.episodes, num_envs=most, done=done)
@@ -177,7 +180,7 @@ def _chosen_episodes(config: EvalConfig, suite: Suite) -> tuple[tuple[int, ...],
 
 
 def _check_make(simulator: Simulator, config: EvalConfig) -> None:
-    """Fail before the first batch when ``make`` does not know an argument."""
+    """Fail before the first episode when ``make`` does not know an argument."""
     try:
         inspect.signature(simulator.make).bind(config.suite, tasks=[], episodes=[], **make_arguments(config))
         simulator.check(config.suite, make_arguments(config))

@@ -1,8 +1,8 @@
 """From episode records to numbers: success rates with Wilson 95 % intervals, by task and for the suite.
 
 Records come in, a :class:`Summary` goes out, ready for JSON; ``tables`` writes it for the screen and for documents.
-A faulted episode counts as a failure. An episode whose batch raised an error has no verdict: it is left out of the rate
-and counted beside it, as is one that never ran.
+A faulted episode counts as a failure. An episode that an error ended has no verdict: it is left out of the rate and
+counted beside it, as is one that never ran.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Row:
         low, high: Wilson 95 % interval of the rate, None without episodes.
         steps_to_solve: mean control ticks of solved episodes, None without any.
         faults: episodes whose slot was quarantined; they count as failures.
-        errors: episodes without a verdict because their batch raised.
+        errors: episodes without a verdict, because an error ended them.
         missing: episodes that were planned and never ran.
     """
 
@@ -224,7 +224,7 @@ def _seconds(records: Sequence[Record]) -> tuple[float, float]:
     """Seconds of setup and of running.
 
     Slots that are placed together note the same setup. Shares of policy, physics and images add up to the time of
-    running; of a batch without them, the time is that until its last episode ended.
+    running; of a stream without them, the time is that until its last episode ended.
     """
     setup = {(record.run, record.batch, record.setup_s) for record in records}
     shares: dict[tuple[int, int], float] = {}
