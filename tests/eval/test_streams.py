@@ -152,7 +152,7 @@ def test_slots_for_which_nothing_waits_stay_where_their_episode_ended(tmp_path: 
     """A reset begins the episodes of all finished slots again; the harness must not run them a second time."""
     ticks: list[int] = []
     world = FakeWorld()
-    config = EvalConfig(suite=SUITE, policy="zero", tasks="0", episodes="5", num_envs=3)
+    config = EvalConfig(suite=SUITE, policy="zero", tasks="0-1", episodes="5", num_envs=5, max_steps=10)
     result = evaluate(
         config,
         begin(config, tmp_path / "r"),
@@ -161,4 +161,5 @@ def test_slots_for_which_nothing_waits_stay_where_their_episode_ended(tmp_path: 
     )
     assert result.ok
     assert ticks == sorted(ticks)
-    assert ticks[-1] == sum(record.num_steps for record in result.records) == 2 + 3 + 4 + 5 + 6
+    # The slots of task 0 have nothing left to run while those of task 1 begin other episodes.
+    assert ticks[-1] == sum(record.num_steps for record in result.records) == 2 + 3 + 4 + 5 + 6 + 5 * 10

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from support.images import needs_gl
 from typer.testing import CliRunner, Result
+from vecenv_eval.cli.video import SETTINGS
 from vecenv_eval.config import EvalConfig, option_name
-from vecenv_eval.video.cli import SETTINGS
 
 from vecenv.cli import build_app
 from vecenv.contract import BatchEnv, ResetInfo
@@ -118,7 +118,7 @@ def test_a_saved_evaluation_can_be_filmed_as_far_as_it_applies(tmp_path: Path, m
         seen.append(config)
         return 1, 0, 1
 
-    from vecenv_eval.video import rollout
+    from vecenv_eval import rollout
 
     monkeypatch.setattr(rollout, "record_config", record)
     chosen: dict[str, Any] = {"suite": "libero_goal", "tasks": "3", "seed": 5, "cameras": ("wrist",)}

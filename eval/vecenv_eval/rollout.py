@@ -19,8 +19,10 @@ from vecenv_eval.environments import Environments
 from vecenv_eval.episodes import Stream
 from vecenv_eval.policies import Closing, Policy
 from vecenv_eval.runner import Evaluation, check_cameras
-from vecenv_eval.video import MOST_EPISODES
 from vecenv_eval.video.writer import Recordable, recording
+
+# Most episodes that one video shows.
+MOST_EPISODES = 100
 
 
 class RecordableEnv(BatchEnv, Recordable, Protocol):

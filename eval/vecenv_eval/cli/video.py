@@ -17,8 +17,9 @@ import typer
 from vecenv.cli import fail
 from vecenv_eval.cli.options import some_settings, user_errors, with_settings
 from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.video import MAX_STEPS
 
+# Step budget of LIBERO's videos, control ticks.
+_MAX_STEPS = 400
 SETTINGS = (
     *("suite", "policy", "tasks", "episodes", "policy_args", "protocol", "backend", "max_steps", "seed"),
     *("image_size", "lod", "colors", "cameras", "env_args", "num_threads"),
@@ -28,7 +29,7 @@ _ALSO = {"tasks": "--task", "image_size": "--size", "cameras": "--camera"}
 _USUAL = {"tasks": "0", "episodes": "1"}
 _SHOWN = {
     **_USUAL,
-    "max_steps": f"{MAX_STEPS} in LIBERO without --protocol; else the protocol's",
+    "max_steps": f"{_MAX_STEPS} in LIBERO without --protocol; else the protocol's",
     "cameras": "agentview",
 }
 _HELPS = {
@@ -53,7 +54,7 @@ def video_command(
             fail(f"--out {out}: videos are written as .mp4")
         if not given.get("suite"):
             fail("--suite is needed; `vecenv list` names the suites")
-        from vecenv_eval.video.rollout import record_config
+        from vecenv_eval.rollout import record_config
 
         frames, solved, count = record_config(_with_budget(EvalConfig.from_dict(given), "protocol" in given), out)
     typer.echo(f"{out}: {frames} frames, {solved} of {count} episodes solved")
@@ -68,5 +69,5 @@ def _with_budget(config: EvalConfig, protocol_given: bool) -> EvalConfig:
     if len(config.suites) != 1:
         raise ConfigError(f"--suite {config.suite}: a video shows one suite")
     if config.max_steps is None and not protocol_given and vecenv.family(config.suite) == "libero":
-        return replace(config, max_steps=MAX_STEPS)
+        return replace(config, max_steps=_MAX_STEPS)
     return config
