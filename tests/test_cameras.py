@@ -61,7 +61,8 @@ def test_a_camera_of_the_users_own_can_be_asked_for() -> None:
 @needs_gl
 def test_what_is_left_out_does_not_change_what_is_drawn() -> None:
     images = []
-    for options in ({"cameras": ["frontview"]}, {}):
+    choices: list[dict[str, Any]] = [{"cameras": ["frontview"]}, {}]
+    for options in choices:
         with vecenv.make(**LIBERO, render={"height": 32, "width": 32, "lod": "fast"}, **options) as env:
             env.reset()
             images.append(env.observe_egocentric().images["frontview"])

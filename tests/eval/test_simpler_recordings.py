@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.demos.files import find_files, read_files
 from vecenv_eval.demos.outcomes import ReplayReport
-from vecenv_eval.demos.replay import ReplayConfig, replay
+from vecenv_eval.demos.replay import OTHER_FILES, ReplayConfig, replay
 from vecenv_eval.report.run import read_run
 from vecenv_eval.results import EvalResult, begin, resume
 from vecenv_eval.runner import evaluate
@@ -90,6 +90,16 @@ def test_a_recording_says_which_episode_it_is_and_holds_every_state(solved: Path
         assert demo.attrs["final_state"].shape == demo.attrs["init_state"].shape
 
 
+def test_it_is_said_when_other_files_are_missing_than_on_record(solved: Path, tmp_path: Path) -> None:
+    path = tmp_path / "copy.hdf5"
+    path.write_bytes((solved / "demos" / "simpler-bridge_1.hdf5").read_bytes())
+    with h5py.File(path, "r+") as file:
+        data: Any = file["data"]
+        assert "bridge_table_1_v1.glb is missing" in data["demo_0"].attrs["stand_ins"]
+        data["demo_0"].attrs["stand_ins"] = "[]"
+    assert [outcome.note for outcome in replayed(tmp_path).outcomes] == [OTHER_FILES, ""]
+
+
 class Advancing:
     """Says after two ticks that the first half of the task is done, in every second slot."""
 
@@ -150,6 +160,8 @@ def test_the_second_half_of_a_task_begins_at_the_tick_on_record(tmp_path: Path) 
         (lambda demo: demo.attrs.create("make", '{"protocol": "x"}'), "protocol='x' is not available"),
         (lambda demo: demo.attrs.create("make", '{"protocol": "variant-aggregation"}'), f"has no episodes of {CARROT}"),
         (lambda demo: demo.attrs.create("episode", 50), "attribute episode: expected 0 to 49, got"),
+        (lambda demo: demo.attrs.create("stand_ins", "{"), "attribute stand_ins: not JSON"),
+        (lambda demo: demo.attrs.create("stand_ins", "[1]"), "attribute stand_ins: expected a JSON list of texts"),
         (lambda demo: demo.create_dataset("second_half", data=[1, 0]), "second_half: expected one number an action"),
     ],
 )

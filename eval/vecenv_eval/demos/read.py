@@ -6,6 +6,7 @@ demonstration is reported about that one, and the others can still be used.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -96,6 +97,7 @@ def _demo(path: Path, data: h5py.Group, name: str, suite: str, spec: TaskInfo) -
         actions=actions,
         success=_verdict(group, len(actions)),
         second_half=_second_half(group, len(actions)),
+        stand_ins=_stand_ins(group),
     )
 
 
@@ -136,6 +138,18 @@ def _second_half(group: h5py.Group, ticks: int) -> np.ndarray | None:
     if dataset.shape != (ticks,):
         raise DemoError(f"second_half: expected one number an action, [{ticks}], got {shape_text(dataset.shape)}")
     return np.asarray(dataset[()]) > 0
+
+
+def _stand_ins(group: h5py.Group) -> tuple[str, ...] | None:
+    """Our own ``stand_ins``; None where there is none."""
+    text = text_attribute(group, "stand_ins")
+    try:
+        value = None if text is None else json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise DemoError(f"attribute stand_ins: not JSON: {error}") from None
+    if value is not None and not (isinstance(value, list) and all(isinstance(each, str) for each in value)):
+        raise DemoError("attribute stand_ins: expected a JSON list of texts")
+    return None if value is None else tuple(value)
 
 
 def _start(group: h5py.Group, suite: str, spec: TaskInfo, ticks: int) -> MadeStart | StoredStart:

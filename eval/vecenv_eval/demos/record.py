@@ -121,6 +121,7 @@ class DemoRecorder:
             options=_of_slot(self._options, slot),
             instruction=record.instruction,
             labels=_labels(env, slot),
+            stand_ins=record.stand_ins,
         )
 
 

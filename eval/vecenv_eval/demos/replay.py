@@ -26,6 +26,7 @@ from vecenv_eval.store import Record
 from vecenv_eval.watch import EpisodeRecorder, watching
 
 NO_FIXTURES = "no model_file: fixtures at their centres"
+OTHER_FILES = "other asset files are missing here than on record"
 # Options of ``vecenv.make`` that the demonstrations themselves decide.
 _NOT_REPLACED = frozenset({"tasks", "episodes", "max_steps", "gripper"})
 _NOT_REPLACED_BECAUSE = "a demonstration decides which episode it is, how long it is, and how its gripper is commanded"
@@ -241,6 +242,9 @@ def _outcome(demo: Demo, control: Control, slot: int, nq: int, before: np.ndarra
     """The outcome of a slot that has just been judged, with its states before and after its last action."""
     ticks = int(control.step_index[slot])
     notes = [NO_FIXTURES] if isinstance(demo.start, StoredStart) and demo.start.fixtures is None else []
+    missing = control.info["stand_ins"][slot] if "stand_ins" in control.info else ()
+    if demo.stand_ins is not None and set(demo.stand_ins) != set(missing):
+        notes.append(OTHER_FILES)
     try:
         difference = _difference(demo, ticks, before, after)
     except DemoError as error:

@@ -56,6 +56,7 @@ class Demo:
         actions: float64 [T, 7], finite.
         success: the verdict on record, None where there is none.
         second_half: of a SIMPLER task in two halves, whether each action belongs to the second, bool [T]; else None.
+        stand_ins: what missing files were replaced by when it was recorded; None where that is not on record.
     """
 
     path: Path
@@ -66,6 +67,7 @@ class Demo:
     actions: np.ndarray
     success: bool | None
     second_half: np.ndarray | None = None
+    stand_ins: tuple[str, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -113,6 +115,7 @@ class Recording:
         options: keyword arguments of ``vecenv.make``, see ``make_options``; plain JSON types.
         instruction: what the policy was told.
         labels: what else identifies the episode, such as its protocol; for readers.
+        stand_ins: what missing files were replaced by.
     """
 
     episode: int
@@ -126,3 +129,4 @@ class Recording:
     options: Mapping[str, Any] = field(default_factory=dict)
     instruction: str = ""
     labels: Mapping[str, str | int] = field(default_factory=dict)
+    stand_ins: tuple[str, ...] = ()

@@ -83,4 +83,5 @@ def _write_demo(data: h5py.Group, recording: Recording) -> None:
         episode=recording.episode,
         make=json.dumps(recording.options),
         instruction=recording.instruction,
+        stand_ins=json.dumps(recording.stand_ins),
     )
