@@ -91,3 +91,21 @@ def test_simpler_has_one_camera() -> None:
     assert vecenv.make_config("simpler/bridge", {"cameras": ["agentview"]}).cameras == ("agentview",)
     with pytest.raises(UnknownCamera, match="there is no camera 'wrist'; cameras: agentview"):
         vecenv.make_config("simpler/bridge", {"cameras": ["wrist"]})
+
+
+def test_gymnasium_observes_the_cameras_that_there_are() -> None:
+    from vecenv.interop.observing import GymnasiumError, Observer
+    from vecenv.libero.env import LiberoEnv
+
+    with vecenv.make(**LIBERO, cameras=["frontview", "birdview"]) as env:
+        assert isinstance(env, LiberoEnv)
+        assert Observer(env, "pixels").cameras == ("frontview", "birdview")
+        with pytest.raises(GymnasiumError, match="expected some of frontview, birdview"):
+            Observer(env, "pixels", ["wrist"])
+
+
+def test_lerobots_environments_keep_their_two_cameras() -> None:
+    from vecenv.interop.lerobot import LeRobotError, LeRobotOptions
+
+    with pytest.raises(LeRobotError, match="cameras: LeRobot's policies expect"):
+        LeRobotOptions(fields={"cameras": ["frontview"]})

@@ -204,6 +204,7 @@ def test_a_part_that_is_a_number_is_averaged(tmp_path: Path) -> None:
     opened = [record.parts["qpos"] for record in result.records]
     assert (part.name, part.episodes, part.held, part.share) == ("qpos", 2, None, None)
     assert part.mean == pytest.approx(sum(opened) / 2)
+    assert part.mean is not None
     assert part.mean > 0.1  # metres: the drawer begins open
     assert f"| qpos | 2 | mean {part.mean:.4g} |" in (tmp_path / "r" / "report.md").read_text()
 
