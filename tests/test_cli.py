@@ -245,7 +245,7 @@ def test_eval_exits_1_when_a_verdict_is_lacking_and_says_how_to_go_on(world: Fak
     world.raise_in = {0: ValueError("boom")}
     result = evaluate("--out", "here")
     assert result.exit_code == 1
-    assert "error in a batch: ValueError: boom" in result.stdout
+    assert "error that ended episodes: ValueError: boom" in result.stdout
     assert "vecenv eval --resume here" in result.stdout
     world.raise_in = None
     again = invoke("eval", "--resume", "here")

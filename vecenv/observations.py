@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from vecenv.errors import NotFound
+from vecenv.errors import InvalidInput, NotFound
 
 
 class ImagesUnavailable(NotFound):
@@ -51,6 +51,29 @@ _CAMERA_ALIASES: Mapping[str, str] = MappingProxyType(
         "robot0_eye_in_hand_image": "wrist",
     }
 )
+
+
+def choose_cameras(names: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
+    """Some cameras by name, in the order asked for; LIBERO's names of the two policy cameras work as well.
+
+    Args:
+        names: the cameras asked for.
+        there: the cameras there are.
+
+    Raises:
+        UnknownCamera: one of them does not exist; the message names it and those that do.
+        InvalidInput: none is asked for, or one twice.
+    """
+    if isinstance(names, str) or not names:
+        raise InvalidInput(f"cameras={names!r}: give some of {', '.join(there)}, as a sequence of names")
+    aliased = [_CAMERA_ALIASES.get(name, name) for name in names]
+    chosen = [alias if alias in there else name for alias, name in zip(aliased, names, strict=True)]
+    for name in chosen:
+        if name not in there:
+            raise UnknownCamera(f"there is no camera {name!r}; cameras: {', '.join(there)}")
+        if chosen.count(name) > 1:
+            raise InvalidInput(f"cameras={list(names)}: {name!r} is named twice")
+    return tuple(chosen)
 
 
 class Rendered(Mapping[str, _Shown]):

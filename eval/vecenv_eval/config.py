@@ -131,6 +131,13 @@ class EvalConfig:
     colors: str | None = field(
         default=None, metadata=_about("Colors of images: published or current (LIBERO).", default="published")
     )
+    cameras: str | Sequence[str] | None = field(
+        default=None,
+        metadata=_about(
+            "Cameras that policies, videos and LeRobot data get; repeatable, or a,b.",
+            default="all of the scene; videos and data: agentview,wrist",
+        ),
+    )
     env_args: Mapping[str, Any] = field(
         default_factory=dict, metadata=_about("key=value for vecenv.make; repeatable.", flag="env-arg")
     )
@@ -173,7 +180,7 @@ class EvalConfig:
             "Run part i of n of the episodes: i/n; `vecenv merge` joins the parts.", default="all", decides=False
         ),
     )
-    fail_fast: bool = field(default=False, metadata=_about("Stop at the first batch that raises.", resumable=True))
+    fail_fast: bool = field(default=False, metadata=_about("Stop when an error ends episodes.", resumable=True))
     engine: str = field(
         default="local",
         metadata=_about("Where episodes run: local, ray (actors) or submitit (Slurm jobs).", resumable=True),
@@ -189,6 +196,8 @@ class EvalConfig:
         if self.store not in STORE_CHOICES:
             raise ConfigError(f"store={self.store!r}: expected one of {', '.join(STORE_CHOICES)}")
         parse_shard(self.shard)
+        if self.cameras is not None and not self.camera_names:
+            raise ConfigError(f"cameras={self.cameras!r}: no camera is named")
         for each in fields(self):
             value, minimum = getattr(self, each.name), setting(each).minimum
             if minimum is not None and value is not None and value < minimum:
@@ -219,6 +228,12 @@ class EvalConfig:
     def policy_name(self) -> str:
         """The policy to run: the one given, else the suite's scripted one."""
         return self.policy or default_policy(self.suites[0])
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The cameras asked for, without repetition; () where the suite's own hold."""
+        given = [self.cameras] if isinstance(self.cameras, str) else self.cameras or ()
+        return tuple(dict.fromkeys(name.strip() for text in given for name in text.split(",") if name.strip()))
 
     @property
     def records(self) -> bool:
@@ -253,8 +268,9 @@ class EvalConfig:
 
         path.parent.mkdir(parents=True, exist_ok=True)
         values = self.to_dict()
-        if not isinstance(self.episodes, str):
-            values["episodes"] = list(self.episodes)
+        for name in ("episodes", "cameras"):
+            if isinstance(values[name], tuple):
+                values[name] = list(values[name])
         path.write_text(yaml.safe_dump(values, sort_keys=False))
 
 

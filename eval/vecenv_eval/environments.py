@@ -1,4 +1,4 @@
-"""The environment that runs the batches: built once, re-placed while scenes stay the same, closed at the end.
+"""The environment that runs streams of episodes: built once, re-placed while scenes stay the same, closed at the end.
 
 A :class:`~vecenv_eval.episodes.Stream` comes in; :class:`Placed` goes out: its first episodes after their reset, and
 which of them is in each slot.
@@ -80,10 +80,8 @@ class Environments:
 
     def _make(self, stream: Stream) -> BatchEnv:
         """Build an environment. A value it refuses is the config's fault: no other stream would fare better."""
-        by_task = {t: [slot.episode for slot in stream.first if slot.task == t] for t in stream.tasks}
-        alike = all(episodes == by_task[stream.tasks[0]] for episodes in by_task.values())
-        placed = {"tasks": list(stream.tasks), "episodes": by_task[stream.tasks[0]] if alike else by_task}
-        arguments = {**placed, **make_arguments(self._config)}
+        episodes = {t: [slot.episode for slot in stream.first if slot.task == t] for t in stream.tasks}
+        arguments = {"tasks": list(stream.tasks), "episodes": episodes, **make_arguments(self._config)}
         try:
             return self._simulator.make(stream.suite, **arguments)
         except AssetsMissing as error:
@@ -93,22 +91,33 @@ class Environments:
 
 
 def make_arguments(config: EvalConfig) -> dict[str, Any]:
-    """Keyword arguments of ``make`` for every batch, without tasks and episodes."""
+    """Keyword arguments of ``make`` for every stream, without tasks and episodes."""
     arguments = {"backend": config.backend, "num_threads": config.num_threads, **config.env_args}
     given: dict[str, Any] = {"max_steps": config.max_steps}
     if family(config.suite) == protocols.LIBERO:  # SIMPLER's episodes depend on their number alone
         given["seed"] = config.seed
-    images = {"height": config.image_size, "width": config.image_size, "lod": config.lod, "colors": config.colors}
-    wanted = {name: value for name, value in images.items() if value is not None}
-    if wanted:
-        if family(config.suite) != protocols.LIBERO:
-            raise ConfigError(
-                f"{config.suite}: image size, level of detail and colors are LIBERO's; SIMPLER's are fixed"
-            )
-        arguments["render"] = {**_render_of(arguments), **wanted}
+    given |= image_arguments(config)
     if config.protocol != protocols.DEFAULT:
         given["protocol"] = config.protocol
     return {**arguments, **{name: value for name, value in given.items() if value is not None}}
+
+
+def image_arguments(config: EvalConfig) -> dict[str, Any]:
+    """Keyword arguments of ``make`` that decide images: ``render`` and ``cameras``, as far as they are given.
+
+    Raises:
+        ConfigError: SIMPLER's images do not have the option.
+    """
+    images = {"height": config.image_size, "width": config.image_size, "lod": config.lod, "colors": config.colors}
+    wanted = {name: value for name, value in images.items() if value is not None}
+    arguments: dict[str, Any] = {"cameras": config.camera_names} if config.camera_names else {}
+    if not wanted:
+        return arguments
+    if family(config.suite) != protocols.LIBERO:
+        given = [option for option in ("image_size", "lod", "colors") if getattr(config, option) is not None]
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise ConfigError(f"{config.suite} does not take {options}: SIMPLER's images are fixed")
+    return {**arguments, "render": {**_render_of(config.env_args), **wanted}}
 
 
 def _render_of(arguments: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -1,7 +1,8 @@
-"""Which episodes an evaluation runs, and in which batches.
+"""Which episodes an evaluation runs, and in which streams.
 
-Specifications as a person writes them (``"0,3,5-7"``) come in; out go :class:`Batch` objects: rectangles of tasks times
-episodes, at most ``num_envs`` slots each, tasks that share a scene side by side, without what has already been done.
+Specifications as a person writes them (``"0,3,5-7"``) come in; out go :class:`Stream` objects, without what has already
+been done: at most ``num_envs`` slots each, in which an episode follows when one ends. For policies that cannot begin
+single slots there are :class:`Batch` objects, rectangles of tasks times episodes, which nothing follows.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ class Suite:
         every: how many of them ``"all"`` runs; None for all.
         tasks: name of each task, by which it may be asked for; may be empty.
         max_slots: most episodes to run at once by default.
+        cameras: names of the cameras in the scene of each task; empty where they are not known.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Suite:
     every: int | None = None
     tasks: tuple[str, ...] = ()
     max_slots: int = MAX_SLOTS
+    cameras: tuple[tuple[str, ...], ...] = ()
 
     def episodes_of(self, task: int) -> int:
         """How many episodes of a task can be run."""

@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import traceback
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict
-from typing import TypeAlias
 
 import numpy as np
 
@@ -22,22 +20,17 @@ from vecenv.contract import BatchEnv, Control, Metrics
 from vecenv_eval.clocks import EpisodeClocks
 from vecenv_eval.conditions import conditions
 from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.datasets.lerobot import LeRobotWriter
 from vecenv_eval.drive import drive
-from vecenv_eval.environments import Environments, Placed, make_arguments, slots_of
+from vecenv_eval.environments import Environments, Placed, slots_of
 from vecenv_eval.episodes import Episode, Stream, Suite, plan, streams
 from vecenv_eval.policies import Ending, Policy, Refillable, extras_of
+from vecenv_eval.recorders import make_recorders
 from vecenv_eval.results import Progress, count
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.sink import Sink
 from vecenv_eval.store import Record, StoreError
-from vecenv_eval.video.episodes import NONE, EpisodeVideos
 from vecenv_eval.watch import watching
 
-# Called with which slots have just finished, bool [B], with the verdicts, bool [B], and with the faults, B strings.
-_Finish: TypeAlias = Callable[[np.ndarray, np.ndarray, Sequence[str]], None]
-# Called with the slots that begin other episodes, and with the episodes.
-_Begin: TypeAlias = Callable[[Sequence[int], Sequence[int]], None]
 # On a GPU a reset of a few slots costs as much as of all: slots wait until this share of them can begin together.
 _SHARE_TO_REFILL = {"native": 0.0, "physx_cpu": 0.0}
 _GPU_SHARE = 1 / 16
@@ -104,8 +97,7 @@ class EpisodeLoop:
         self._records = {key: r for key, r in store.records().items() if key in wanted and not r.error}
         self._progress = _ProgressReports(on_progress, len(wanted), self._records)
         self._environments = Environments(simulator, suite, config, self._write_conditions)
-        self._videos = None if config.video == NONE else EpisodeVideos(store.folder, config.video)
-        self._dataset = LeRobotWriter(store.folder / "lerobot") if config.record_lerobot else None
+        self._recorders = make_recorders(config, suite, simulator, store)
         self._number = self._failures = self._verdicts = 0
         self._refill_share = _SHARE_TO_REFILL.get(config.backend, _GPU_SHARE)
 
@@ -155,8 +147,8 @@ class EpisodeLoop:
     def close(self) -> None:
         """Close the environment and whatever watches it."""
         self._environments.close()
-        for watcher in self._watchers:
-            watcher.close()
+        for recorder in self._recorders:
+            recorder.close()
 
     def _run_all(self, queue: deque[Stream]) -> bool:
         """Run streams until none is left; False when to stop for good."""
@@ -189,8 +181,9 @@ class EpisodeLoop:
             return Stream(stream.suite, ())
         running = _Running(self._suite, placed, stream)
         try:
-            with self._recording(running) as (begin, finish), watching(placed.env, self._watchers):
-                self._run_placed(number, running, begin, finish)
+            self._begin_recording(running, range(len(running.slots)))
+            with watching(placed.env, self._recorders):
+                self._run_placed(number, running)
         except StoreError:
             raise  # what cannot be stored need not run
         except Exception as error:  # whatever a policy or a simulator raises concerns the running episodes only
@@ -199,7 +192,7 @@ class EpisodeLoop:
             return running.rest(len(placed.slots))
         return None
 
-    def _run_placed(self, number: int, running: _Running, begin: _Begin, finish: _Finish) -> None:
+    def _run_placed(self, number: int, running: _Running) -> None:
         """Let the policy act until every slot has finished and nothing waits."""
         env, progress = running.placed.env, self._progress
         clocks = EpisodeClocks(env, running.placed.setup_s)
@@ -210,12 +203,12 @@ class EpisodeLoop:
             nonlocal ended
             rows = running.slots_to_refill(done, self._refill_share)
             if len(rows):
-                ended += int(env.evaluate().num_steps[rows].sum())
+                ended += int(env.evaluate().num_steps[done].sum())
                 began = clocks.now()
-                running.refill(rows)
+                running.refill(rows, done)
                 assert isinstance(self._policy, Refillable)
                 self._policy.reset_slots(env, running.info, rows)
-                begin(rows.tolist(), [running.slots[row].episode for row in rows.tolist()])
+                self._begin_recording(running, rows.tolist())
                 clocks.begin(rows, clocks.now() - began)
             return rows
 
@@ -225,10 +218,10 @@ class EpisodeLoop:
             clocks.tick(control)
             if finished.any():
                 metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
-                finish(finished, metrics.success, control.info["fault"])
-                records = [self._record(number, running, i, metrics, control, clocks) for i in slots]
-                self._finish_watchers(env, slots, records)
-                self._write(records)
+                records = {slot: self._record(number, running, slot, metrics, control, clocks) for slot in slots}
+                for recorder in self._recorders:
+                    recorder.finish(env, records)
+                self._write(list(records.values()))
                 self._verdicts += len(slots)
                 self._tell_policy(running, slots)
             progress.steps, progress.seconds = (
@@ -237,48 +230,14 @@ class EpisodeLoop:
             )
             progress.report(number)
 
-    def _finish_watchers(self, env: BatchEnv, slots: Sequence[int], records: Sequence[Record]) -> None:
-        for slot, record in zip(slots, records, strict=True):
-            if self._videos is not None:
-                self._videos.finish(slot, record, env)
-            if self._dataset is not None:
-                self._dataset.finish(slot, record)
-
-    @property
-    def _watchers(self) -> list[EpisodeVideos | LeRobotWriter]:
-        return [watcher for watcher in (self._videos, self._dataset) if watcher is not None]
+    def _begin_recording(self, running: _Running, slots: Iterable[int]) -> None:
+        for recorder in self._recorders:
+            recorder.begin(running.placed.env, {slot: running.slots[slot] for slot in slots})
 
     def _tell_policy(self, running: _Running, slots: Sequence[int]) -> None:
         if isinstance(self._policy, Ending):
             for slot in slots:
                 self._policy.episode_end(slot, asdict(self._records[running.slots[slot]]))
-
-    @contextmanager
-    def _recording(self, running: _Running) -> Iterator[tuple[_Begin, _Finish]]:
-        """Record the episodes when asked to; gives what to call with slots that begin, and with slots that finish."""
-        if not self._config.records:
-            yield lambda slots, episodes: None, lambda finished, success, faults: None
-            return
-        from vecenv_eval.demos.options import make_options
-        from vecenv_eval.demos.record import Recorder
-
-        options = make_options(self._simulator.make, suite=self._suite.name, **make_arguments(self._config))
-        episodes = [slot.episode for slot in running.slots]
-        recorder = Recorder(running.placed.env, episodes, options, states=self._config.record_states)
-
-        def finish(finished: np.ndarray, success: np.ndarray, faults: Sequence[str]) -> None:
-            # A recording is on the disk before its verdict is: what has a verdict is not run again.
-            recorder.finish(finished, success, faults)
-            taken = recorder.take()
-            by_task: dict[tuple[str, int], list[int]] = {}
-            for slot in taken:
-                by_task.setdefault((running.slots[slot].suite, running.slots[slot].task), []).append(slot)
-            for key, slots in by_task.items():
-                chosen = [taken[slot] for slot in slots]
-                self._store.add_demos(*key, self._suite.instructions[key[1]], chosen)
-
-        with recorder.listening():
-            yield recorder.begin, finish
 
     def _record(
         self, number: int, running: _Running, slot: int, metrics: Metrics, control: Control, clocks: EpisodeClocks
@@ -307,12 +266,13 @@ class EpisodeLoop:
             images_s=seconds["images_s"],
             extras=extras_of(self._policy, slot),
             stand_ins=tuple(control.info["stand_ins"][slot]) if "stand_ins" in control.info else (),
+            parts=dict(control.info["parts"][slot]) if "parts" in control.info else {},
         )
 
     def _write_errors(self, number: int, episodes: Sequence[Episode], error: Exception) -> None:
         cause = f"{type(error).__name__}: {error}".splitlines()[0]
         self.causes[cause] = None
-        self._store.log_error(f"run {self._index} batch {number} ({len(episodes)} episodes)\n{traceback.format_exc()}")
+        self._store.log_error(f"run {self._index} stream {number} ({len(episodes)} episodes)\n{traceback.format_exc()}")
         failed = [
             Record(
                 suite=episode.suite,
@@ -367,8 +327,8 @@ class _Running:
         enough = len(rows) >= share * len(done) or done.all()
         return np.array(rows if enough else [], int)
 
-    def refill(self, rows: np.ndarray) -> None:
-        """Place the next episode of their scene in finished slots, and reset them."""
+    def refill(self, rows: np.ndarray, done: np.ndarray) -> None:
+        """Place the next episode of their scene in slots, and reset them; other slots that are done stay so."""
         for row in rows.tolist():
             self.slots[row] = self._waiting[self._suite.scenes[self.slots[row].task]].popleft()
         chosen = [self.slots[row] for row in rows.tolist()]
@@ -376,6 +336,8 @@ class _Running:
         env.set_episodes(tasks=[e.task for e in chosen], episodes=[e.episode for e in chosen], slots=rows)
         self.info = env.reset()
         slots_of(self.info, self.slots)
+        # A reset begins the episodes of all finished slots again, of those too for which nothing waits.
+        env.end_episodes(np.setdiff1d(np.flatnonzero(done), rows))
 
     def rest(self, num_slots: int) -> Stream:
         """The episodes that have not begun, for as many slots."""

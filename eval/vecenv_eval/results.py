@@ -54,7 +54,7 @@ class EvalResult:
         records: the record of each episode that ran.
         folder: the results folder.
         interrupted: it was stopped from the keyboard.
-        causes: what the failed batches of this run raised, without repetition.
+        causes: the errors that ended episodes in this run, without repetition.
     """
 
     summary: Summary

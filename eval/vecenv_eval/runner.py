@@ -1,26 +1,27 @@
 """Evaluate a policy on a suite: check the config, run what has no verdict yet, summarise.
 
 An :class:`~vecenv_eval.config.EvalConfig` and a results folder come in; :class:`Evaluation` refuses what cannot run
-before anything is built, plans the batches, has an engine run them (``vecenv_eval.engine``) and returns an
+before anything is built, plans the streams of episodes, has an engine run them (``vecenv_eval.engine``) and returns an
 :class:`~vecenv_eval.results.EvalResult`.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
 from pathlib import Path
 
 from vecenv import family, protocols
 from vecenv.errors import VecenvError
+from vecenv.observations import UnknownCamera, choose_cameras
 from vecenv.placement import episode_indices
 from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy, parse_shard
 from vecenv_eval.engine import EngineError, make_engine
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, shard
 from vecenv_eval.loop import make_streams
-from vecenv_eval.policies import Closing, Policy, check_policy, make_policy
+from vecenv_eval.policies import Closing, Policy, Seeing, check_policy, make_policy
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.results import POLICY_NAME, EvalResult, Progress, open_or_begin, write_results
 from vecenv_eval.simulator import Simulator, vecenv_simulator
@@ -78,8 +79,15 @@ class Evaluation:
 
     @cached_property
     def policy(self) -> Policy:
-        """The policy in this process, made when it is first asked for."""
-        return make_policy(self.config.policy_name, seed=self.policy_seed, **self.config.policy_args)
+        """The policy in this process, made when it is first asked for.
+
+        Raises:
+            ConfigError: it reads a camera that it would not get.
+        """
+        policy = make_policy(self.config.policy_name, seed=self.policy_seed, **self.config.policy_args)
+        if isinstance(policy, Seeing):
+            _check_cameras_of(policy, self.config, self.suite, self.tasks)
+        return policy
 
     @property
     def policy_seed(self) -> int:
@@ -94,7 +102,10 @@ class Evaluation:
         return tuple(Episode(self.suite.name, task, e) for task in self.tasks for e in self.episodes[task])
 
     def streams(self, done: Collection[Episode] = ()) -> list[Stream]:
-        """What runs the planned episodes but those in ``done``; batches, if the policy cannot begin single slots."""
+        """What runs the planned episodes but those in ``done``.
+
+        Nothing follows in a slot if the policy cannot begin single slots.
+        """
         return make_streams(
             self.policy, self.suite, self.tasks, self.episodes, num_envs=self.config.num_envs, done=done
         )
@@ -142,7 +153,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     suite = simulator.suite(config.suite, config.protocol)
     tasks, episodes = chosen_episodes(config, suite)
     _check_make(simulator, config)
-    _check_record(config)
+    check_cameras(config, suite, tasks)
     _check_policy(config)
     check_policy(config.policy_name, **config.policy_args)
     make_engine(config)
@@ -167,7 +178,7 @@ def chosen_episodes(config: EvalConfig, suite: Suite) -> tuple[tuple[int, ...], 
 
 
 def _check_make(simulator: Simulator, config: EvalConfig) -> None:
-    """Fail before the first batch when ``make`` does not know an argument."""
+    """Fail before the first episode when ``make`` does not know an argument."""
     try:
         inspect.signature(simulator.make).bind(config.suite, tasks=[], episodes=[], **make_arguments(config))
         simulator.check(config.suite, make_arguments(config))
@@ -184,7 +195,36 @@ def _check_policy(config: EvalConfig) -> None:
         raise ConfigError("policy 'voxposer' knows Panda's and WidowX's hands, not the Google Robot's")
 
 
-def _check_record(config: EvalConfig) -> None:
-    """Recordings are LIBERO's HDF5 files: they hold MuJoCo states and begin from LIBERO's init states."""
-    if config.records and family(config.suite) == protocols.SIMPLER:
-        raise ConfigError(f"{config.suite} cannot be recorded: recordings are in LIBERO's layout, for LIBERO's suites")
+def check_cameras(config: EvalConfig, suite: Suite, tasks: Collection[int]) -> None:
+    """Refuse cameras that the scene of a task does not have.
+
+    Raises:
+        ConfigError: there is no such camera; the message names it and those that there are.
+    """
+    for task in tasks if config.camera_names and suite.cameras else ():
+        try:
+            choose_cameras(config.camera_names, _cameras_of(config, suite, task))
+        except VecenvError as error:
+            raise ConfigError(f"{suite.name} task {task}: {error}") from None
+
+
+def _check_cameras_of(policy: Seeing, config: EvalConfig, suite: Suite, tasks: Collection[int]) -> None:
+    """Refuse a policy that reads the images of a camera that it would not get."""
+    for task in tasks if suite.cameras else ():
+        there = _cameras_of(config, suite, task)
+        if config.camera_names:
+            there = choose_cameras(config.camera_names, there)
+        for name in policy.needed_cameras():
+            try:
+                choose_cameras([name], there)
+            except UnknownCamera:
+                what = f"policy {config.policy_name!r} reads camera {name!r}"
+                raise ConfigError(f"{what}; {suite.name} task {task} has {', '.join(there)} here") from None
+
+
+def _cameras_of(config: EvalConfig, suite: Suite, task: int) -> tuple[str, ...]:
+    """The cameras of a task's scene, and those that ``--env-arg render=...`` adds."""
+    render = config.env_args.get("render")
+    added = render.get("cameras", ()) if isinstance(render, Mapping) else ()
+    names = [str(each.get("name")) if isinstance(each, Mapping) else str(getattr(each, "name", "")) for each in added]
+    return (*suite.cameras[task], *names)

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 import vecenv
 from vecenv import protocols
 from vecenv.contract import BatchEnv
-from vecenv.libero.tasks.suites import list_tasks
+from vecenv.libero.render.options import ALIASES
+from vecenv.libero.scene.arenas import ARENAS, camera_names
+from vecenv.libero.tasks.suites import TaskSpec, list_tasks
+from vecenv.simpler.config import CAMERAS as SIMPLER_CAMERAS
 from vecenv.util.names import unknown
 from vecenv_eval.config import ConfigError
 from vecenv_eval.episodes import MAX_SLOTS, Suite
@@ -65,4 +68,11 @@ def describe_suite(name: str, protocol: str = protocols.DEFAULT) -> Suite:
         every=None if simpler else per_task,
         tasks=tuple(task.name for task in tasks),
         max_slots=_SIMPLER_SLOTS if simpler else MAX_SLOTS,
+        cameras=(SIMPLER_CAMERAS,) * len(tasks) if simpler else tuple(map(_cameras, list_tasks(name))),
     )
+
+
+def _cameras(task: TaskSpec) -> tuple[str, ...]:
+    """Names of the cameras in the scene of a LIBERO task, and their aliases."""
+    there = camera_names(ARENAS[task.problem().name])
+    return (*there, *(alias for alias, name in ALIASES.items() if name in there))

@@ -1,13 +1,13 @@
-"""Watching episodes while they run: what a watcher is, and how it sees every control tick.
+"""Recording episodes while they run: what an episode recorder is, and how it sees every control tick.
 
-An environment that runs and some watchers come in. :func:`watching` calls ``observe`` of each watcher before every tick
-of every live slot, whichever verb moves it; whoever runs the episodes calls ``finish`` with each record and ``close``
-at the end. ``video.episodes`` and ``datasets.lerobot`` have watchers.
+An environment that runs and some recorders come in. :func:`watching` calls ``observe`` of each recorder before every
+tick of every live slot, whichever verb moves it; whoever runs the episodes calls ``begin`` and ``finish`` around each
+episode and ``close`` at the end. ``video.episodes``, ``datasets.lerobot`` and ``demos.record`` have recorders.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Protocol
@@ -17,11 +17,12 @@ import numpy.typing as npt
 
 from vecenv.contract import BatchEnv
 from vecenv.observations import Egocentric
+from vecenv_eval.episodes import Episode
 from vecenv_eval.store import Record
 
 
 class Observable(Protocol):
-    """The part of an environment that watchers use."""
+    """The part of an environment that shows a tick to recorders."""
 
     @property
     def control_hz(self) -> float:
@@ -33,8 +34,19 @@ class Observable(Protocol):
         ...
 
 
-class EpisodeWatcher(Protocol):
-    """Sees every tick of the slots that run, and the record of each episode that ends."""
+class EpisodeRecorder(Protocol):
+    """Sees episodes begin, every tick of the slots that run, and the record of each episode that ends."""
+
+    def begin(self, env: BatchEnv, episodes: Mapping[int, Episode]) -> None:
+        """Episodes have begun in some slots, which were just reset.
+
+        What was observed in these slots of an episode that never finished is dropped.
+
+        Args:
+            env: the environment.
+            episodes: the episode in each of the slots that begin.
+        """
+        ...
 
     def observe(self, env: Observable, slots: Sequence[int], actions: np.ndarray) -> None:
         """See one tick before it happens.
@@ -46,8 +58,13 @@ class EpisodeWatcher(Protocol):
         """
         ...
 
-    def finish(self, slot: int, record: Record) -> None:
-        """The episode in a slot has ended; what is observed there next belongs to another one."""
+    def finish(self, env: BatchEnv, records: Mapping[int, Record]) -> None:
+        """Episodes have ended. A slot whose beginning was not seen is passed over.
+
+        Args:
+            env: the environment, in which these slots still show the end.
+            records: how the episode in each of the slots ended.
+        """
         ...
 
     def close(self) -> None:
@@ -56,16 +73,16 @@ class EpisodeWatcher(Protocol):
 
 
 @contextmanager
-def watching(env: BatchEnv, watchers: Sequence[EpisodeWatcher]) -> Iterator[None]:
-    """Let watchers observe every tick inside the context; images are rendered once a tick for all of them."""
+def watching(env: BatchEnv, recorders: Sequence[EpisodeRecorder]) -> Iterator[None]:
+    """Let recorders observe every tick inside the context; images are rendered once a tick for all of them."""
 
     def observe(actions: np.ndarray, active: np.ndarray) -> None:
         slots = np.flatnonzero(active).tolist()
         shared = _OneTick(env, slots)
-        for watcher in watchers:
-            watcher.observe(shared, slots, actions)
+        for recorder in recorders:
+            recorder.observe(shared, slots, actions)
 
-    if not watchers:
+    if not recorders:
         yield
         return
     with env.watched(observe):

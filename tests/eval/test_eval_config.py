@@ -108,3 +108,69 @@ def test_a_config_is_all_that_evaluate_needs(world: FakeWorld) -> None:
 def test_a_number_below_its_minimum_is_refused() -> None:
     with pytest.raises(ConfigError, match="max_steps must be at least 1, not 0"):
         EvalConfig(suite=SUITE, max_steps=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("cameras: agentview", ("agentview",)),
+        ("cameras: agentview, wrist", ("agentview", "wrist")),
+        ("cameras: [wrist, 'agentview,frontview', wrist]", ("wrist", "agentview", "frontview")),
+        ("", ()),
+    ],
+)
+def test_cameras_are_a_list_or_a_text_with_commas(tmp_path: Path, text: str, names: tuple[str, ...]) -> None:
+    (tmp_path / "eval.yaml").write_text(f"suite: libero_goal\n{text}\n")
+    config = EvalConfig.load(tmp_path / "eval.yaml")
+    assert config.camera_names == names
+    config.save(tmp_path / "again.yaml")
+    assert EvalConfig.load(tmp_path / "again.yaml").camera_names == names
+
+
+@pytest.mark.parametrize("cameras", ["", " , ", []])
+def test_no_camera_is_refused(cameras: Any) -> None:
+    with pytest.raises(ConfigError, match="no camera is named"):
+        EvalConfig(suite="libero_goal", cameras=cameras)
+
+
+def test_the_option_for_cameras_is_repeatable(tmp_path: Path) -> None:
+    done = invoke("--suite", "libero_goal", "--cameras", "wrist", "--cameras", "agentview,nowhere")
+    assert done.exit_code == 2
+    assert "error: libero_goal task 0: there is no camera 'nowhere'; cameras: frontview, birdview" in done.stderr
+
+
+class Sees:
+    """A policy that reads one camera."""
+
+    name = "sees"
+
+    def __init__(self, camera: str) -> None:
+        self.camera = camera
+
+    def needed_cameras(self) -> list[str]:
+        return [self.camera]
+
+    def reset(self, env: Any, info: Any) -> None: ...
+
+    def act(self, env: Any) -> Any: ...
+
+
+@pytest.mark.parametrize(
+    ("camera", "cameras", "says"),
+    [
+        ("wrist", "agentview", "reads camera 'wrist'; libero_goal task 0 has agentview here"),
+        ("sideview", None, None),
+        ("nowhere", None, "reads camera 'nowhere'; libero_goal task 0 has frontview, birdview"),
+        ("robot0_eye_in_hand", "wrist", None),
+    ],
+)
+def test_a_policy_that_would_not_get_its_images_is_refused_before_anything_runs(
+    camera: str, cameras: str | None, says: str | None
+) -> None:
+    policy = {"policy": f"{__name__}:Sees", "policy_args": {"camera": camera}}
+    config = EvalConfig(suite="libero_goal", tasks="0", cameras=cameras, **policy)
+    if says is None:
+        runner.Evaluation(config)
+        return
+    with pytest.raises(ConfigError, match=says):
+        runner.Evaluation(config)

@@ -73,7 +73,9 @@ def test_what_stood_in_is_printed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"record": True}, "cannot be recorded: recordings are in LIBERO's layout"),
+        ({"image_size": 64, "lod": "fast"}, "simpler/bridge does not take --image-size, --lod: SIMPLER's images are"),
+        ({"cameras": "wrist"}, "environment arguments: there is no camera 'wrist'; cameras: agentview"),
+        ({"policy": "openpi"}, "policy 'openpi' reads camera 'wrist'; simpler/bridge task 0 has agentview here"),
         (
             {"policy": "pick_place"},
             "'pick_place' is not made for simpler/bridge; the scripted one there is 'simpler_scr",

@@ -32,7 +32,7 @@ def run(root: Path, *episodes: tuple[int, Any], env: Any = None) -> Path:
         with watching(env, [writer]):
             for _ in range(ticks):
                 env.tick(0, 1)
-        writer.finish(1, outcome)
+        writer.finish(env, {1: outcome})
     writer.close()
     return root
 

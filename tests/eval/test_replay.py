@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace as changed
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,15 @@ from vecenv_eval.config import EvalConfig
 from vecenv_eval.demos.files import find_files, read_files
 from vecenv_eval.demos.mjcf import fixture_poses
 from vecenv_eval.demos.outcomes import ReplayReport, closing_line
-from vecenv_eval.demos.record import Recorder, RecordError
+from vecenv_eval.demos.record import DemoRecorder, RecordError
 from vecenv_eval.demos.replay import NO_FIXTURES, ReplayConfig, replay
+from vecenv_eval.demos.schema import Recording
+from vecenv_eval.demos.write import write_demos
+from vecenv_eval.episodes import Episode
 from vecenv_eval.results import EvalResult, begin, resume
 from vecenv_eval.runner import evaluate
+from vecenv_eval.store import Record
+from vecenv_eval.watch import watching
 
 from vecenv.cli import build_app
 from vecenv.contract import BatchEnv, Control, ResetInfo, State
@@ -409,26 +415,51 @@ def test_a_fault_is_on_record(tmp_path: Path) -> None:
 def test_fixture_poses_that_differ_between_slots_are_each_slots_own(tmp_path: Path) -> None:
     env = Visible([0], [0, 1])
     poses = {"shelf": (np.array([[1.0, 2, 3], [4, 5, 6]]), np.array([1.0, 0, 0, 0]))}
-    recorder = Recorder(env, [0, 1], {"fixtures": poses})
-    with recorder.listening():
+    recorder = DemoRecorder(keep_in(tmp_path), ["do it"], {"fixtures": poses})
+    recorder.begin(env, {0: Episode(SUITE, 0, 0), 1: Episode(SUITE, 0, 1)})
+    with watching(env, [recorder]):
         env.step_continuous(np.zeros((2, 7)))
-    recorder.finish(np.array([True, True]), np.array([True, False]), ["", ""])
-    fixtures = [recording.options["fixtures"] for recording in recorder.recordings().values()]
+    recorder.finish(env, {0: ended(0), 1: ended(1, success=False)})
+    fixtures = [json.loads(demo["make"])["fixtures"] for demo in recorded(tmp_path).values()]
     assert fixtures == [{"shelf": [[1, 2, 3], [1, 0, 0, 0]]}, {"shelf": [[4, 5, 6], [1, 0, 0, 0]]}]
 
 
 def test_an_environment_that_hides_its_actions_is_not_recorded(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="FakeEnv does not show the actions it executes"):
-        Recorder(FakeEnv([0], [0]), [0], {})
+        DemoRecorder(keep_in(tmp_path), [], {}).begin(FakeEnv([0], [0]), {0: Episode(SUITE, 0, 0)})
     result = record(tmp_path / "r", FakeWorld(), tasks="0")
     assert result.causes == ("RecordError: FakeEnv does not show the actions it executes, so it cannot be recorded",)
 
 
-def test_listening_ends(tmp_path: Path) -> None:
+def test_only_what_happens_while_it_watches_is_recorded(tmp_path: Path) -> None:
     env = Visible([0], [3])
-    recorder = Recorder(env, [3], {})
-    with recorder.listening():
+    recorder = DemoRecorder(keep_in(tmp_path), ["do it"], {})
+    recorder.begin(env, {0: Episode(SUITE, 0, 3)})
+    with watching(env, [recorder]):
         env.step_continuous(np.zeros((1, 2, 7)))
     env.step_continuous(np.ones((1, 7)))
-    recorder.finish(np.array([True]), np.array([True]), [""])
-    np.testing.assert_array_equal(recorder.recordings()[0].actions, np.zeros((2, 7)))
+    recorder.finish(env, {0: ended(3)})
+    np.testing.assert_array_equal(recorded(tmp_path)["0/demo_3"]["actions"], np.zeros((2, 7)))
+
+
+def test_what_a_slot_did_in_an_episode_that_never_finished_is_dropped(tmp_path: Path) -> None:
+    env = Visible([0], [3])
+    recorder = DemoRecorder(keep_in(tmp_path), ["do it"], {})
+    for value in (1.0, 2.0):  # the first is broken off
+        recorder.begin(env, {0: Episode(SUITE, 0, 3)})
+        with watching(env, [recorder]):
+            env.step_continuous(np.full((1, 7), value))
+    recorder.finish(env, {0: ended(3)})
+    recorder.finish(env, {0: ended(3)})  # the slot has not begun again: nothing to write
+    np.testing.assert_array_equal(recorded(tmp_path)["0/demo_3"]["actions"], np.full((1, 7), 2.0))
+
+
+def keep_in(folder: Path) -> Callable[[str, int, str, Sequence[Recording]], None]:
+    """Writes recordings into one file of a folder."""
+    return partial(write_demos, folder / "demos" / "x.hdf5")
+
+
+def ended(episode: int, success: bool = True) -> Record:
+    """How an episode of the fake suite went."""
+    how = {"instruction": "do it", "success": success, "num_steps": 1, "reward": float(success)}
+    return Record(suite=SUITE, task=0, episode=episode, **how)

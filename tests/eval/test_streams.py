@@ -146,3 +146,20 @@ def test_records_of_a_store_have_the_same_verdicts(folder: Path) -> None:
     result = run(folder, FakeWorld(), num_envs=4)
     stored = ResultStore.open(folder).records()
     assert verdicts(tuple(stored.values())) == verdicts(result.records)
+
+
+def test_slots_for_which_nothing_waits_stay_where_their_episode_ended(tmp_path: Path) -> None:
+    """A reset begins the episodes of all finished slots again; the harness must not run them a second time."""
+    ticks: list[int] = []
+    world = FakeWorld()
+    config = EvalConfig(suite=SUITE, policy="zero", tasks="0-1", episodes="5", num_envs=5, max_steps=10)
+    result = evaluate(
+        config,
+        begin(config, tmp_path / "r"),
+        on_progress=lambda now: ticks.append(now.steps),
+        simulator=world.simulator,
+    )
+    assert result.ok
+    assert ticks == sorted(ticks)
+    # The slots of task 0 have nothing left to run while those of task 1 begin other episodes.
+    assert ticks[-1] == sum(record.num_steps for record in result.records) == 2 + 3 + 4 + 5 + 6 + 5 * 10

@@ -153,26 +153,3 @@ def test_every_tick_of_a_batch_is_a_frame_and_the_last_shows_the_verdicts(tmp_pa
     green, red = frames[-1][1, 10], frames[-1][1, -10]
     assert green[1] > green[0]
     assert red[0] > red[1]
-
-
-@pytest.mark.parametrize("option", [{"size": 64}, {"lod": "fast"}])
-def test_simplers_images_have_one_size_and_detail(option: dict[str, Any]) -> None:
-    from vecenv_eval.video.rollout import make_env
-
-    with pytest.raises(ValueError, match=f"--{next(iter(option))}"):
-        make_env("simpler/bridge", "0", 1, option)
-
-
-def test_a_simpler_video_runs_at_its_robots_rate(tmp_path: Path) -> None:
-    pytest.importorskip("av")
-    pytest.importorskip("PIL")
-    import av
-    from vecenv_eval.video.rollout import record_rollout
-
-    env: Any = Countdown()
-    env.robot = SimpleNamespace(control_hz=5)
-    env.step_continuous = lambda _: (env.step(), SimpleNamespace(done=np.array([env.ticks >= 6] * 2)))[1]
-    policy: Any = SimpleNamespace(reset=lambda *_: None, act=lambda _: None)
-    assert record_rollout(env, policy, tmp_path / "simpler.mp4", ["agentview"]) == 7
-    with av.open(str(tmp_path / "simpler.mp4")) as video:
-        assert video.streams.video[0].average_rate == 5

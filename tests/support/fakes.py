@@ -53,6 +53,8 @@ class FakeEnv:
         self.terminated, self.truncated = np.zeros((2, self.num_envs), bool)
 
     def reset(self) -> ResetInfo:
+        done = self.done & (self.ticks > 0)
+        self.ticks[done], self.terminated[done], self.truncated[done] = 0, False, False
         pairs = list(zip(self.tasks.tolist(), self.episodes.tolist(), strict=True))
         return ResetInfo(
             instruction=tuple(f"do thing {task}" for task, _ in pairs),

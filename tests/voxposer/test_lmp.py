@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.llm_server import LlmServer, serving
 from support.lmps import ABOVE, FINDS, OBJECTS, PROMPTS, Answers, Setup, call_of
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
@@ -21,17 +20,6 @@ from voxposer.language.observations import DynamicObservation, DynamicObservatio
 
 # Of a library that litellm uses.
 pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[LlmServer]:
-    with serving() as server:
-        yield server
-
-
-@pytest.fixture
-def setup(running: LlmServer) -> Callable[..., Setup]:
-    return lambda answers, **options: Setup(running, answers, **options)
 
 
 # What the model is asked

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.llm_server import Answer, LlmServer, code, failure, serving
+from support.llm_server import Answer, code, failure
 from support.lmps import ABOVE, FINDS, PROMPTS, Setup, call_of
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
@@ -24,17 +24,6 @@ from voxposer.sandbox.guard import Limits
 
 # Of a library that litellm uses.
 pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[LlmServer]:
-    with serving() as server:
-        yield server
-
-
-@pytest.fixture
-def setup(running: LlmServer) -> Callable[..., Setup]:
-    return lambda answers, **options: Setup(running, answers, **options)
 
 
 # Rights

@@ -62,6 +62,8 @@ class LeRobotOptions:
     def __post_init__(self) -> None:
         if self.obs_type not in OBS_TYPES:
             raise LeRobotError(f"obs_type={self.obs_type!r}: expected one of {', '.join(OBS_TYPES)}")
+        if "cameras" in self.fields:
+            raise LeRobotError("cameras: LeRobot's policies expect the images under the names of its own data sets")
 
     def of_suite(self, suite: str) -> dict[str, object]:
         """Options of ``vecenv.make``."""

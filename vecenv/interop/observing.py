@@ -18,7 +18,7 @@ from vecenv.libero.env import LiberoEnv
 from vecenv.libero.physics.base import Group
 from vecenv.libero.render.options import POLICY_CAMERAS
 from vecenv.libero.scene.scene import Scene
-from vecenv.observations import Egocentric, Rendered
+from vecenv.observations import Egocentric, Rendered, choose_cameras
 
 if TYPE_CHECKING:
     from vecenv.simpler.env import SimplerEnv
@@ -123,7 +123,7 @@ def _names(env: Batch, obs: str | Sequence[str] | None) -> tuple[str, ...]:
 
 def _cameras(shapes: Mapping[str, tuple[int, int]], chosen: Sequence[str] | None) -> tuple[str, ...]:
     if chosen is None:
-        return tuple(camera for camera in POLICY_CAMERAS if camera in shapes)
+        return tuple(camera for camera in POLICY_CAMERAS if camera in shapes) or tuple(shapes)
     cameras = (chosen,) if isinstance(chosen, str) else tuple(chosen)
     unknown = [camera for camera in cameras if camera not in shapes]
     if unknown or not cameras:
@@ -138,6 +138,8 @@ def _image_shapes(env: Batch) -> dict[str, tuple[int, int]]:
         assert isinstance(render, vecenv.RenderConfig)
         in_scene = [{model.camera(index).name for index in range(model.ncam)} for model in env.mj_models]
         names = (*POLICY_CAMERAS, *(camera.name for camera in render.cameras), *sorted(set.intersection(*in_scene)))
+        if env.config.cameras is not None:
+            names = choose_cameras(env.config.cameras, names)
         return dict.fromkeys(names, (render.height, render.width))
     camera = env.tasks[int(env.placement.task[0])].camera
     return {POLICY_CAMERAS[0]: (camera.height, camera.width)}

@@ -81,6 +81,8 @@ class LiberoConfig:
         render: size, level of detail and colors of camera images, and cameras of your own: a ``RenderConfig`` or a
             mapping of its fields. What is not given is as LIBERO was published with. Nothing is rendered that is not
             read.
+        cameras: the cameras that observations show, in this order: names of the scene's cameras (``agentview``,
+            ``wrist``, ``frontview``, ...) or of those that ``render`` adds; None for all of them.
         scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and no LIBERO
             or robosuite files are needed. None for the installed packages.
         waypoint: tolerances and speeds of ``step_ee_pose`` and ``step_waypoints``; also a mapping of its fields.
@@ -101,6 +103,7 @@ class LiberoConfig:
     num_threads: int | None = None
     num_devices: int = 1
     render: Mapping[str, Any] | RenderConfig | None = None
+    cameras: list[str] | tuple[str, ...] | None = None
     scenes: str | Path | None = None
     waypoint: waypoint.WaypointConfig = field(default_factory=waypoint.WaypointConfig)
 

@@ -59,7 +59,8 @@ class LiberoEnv(SlotBatch):
         config: options.
 
     Raises:
-        LiberoError, SceneError, GoalError, FixtureError, TaskDataError: an option names something that does not exist.
+        LiberoError, SceneError, GoalError, FixtureError, TaskDataError, UnknownCamera: an option names something that
+            does not exist.
     """
 
     _error = LiberoError
@@ -70,7 +71,7 @@ class LiberoEnv(SlotBatch):
         self.config = replace(config, **vars(self._rules))
         self._sources = tasks
         self._physics: Physics | None = None
-        self._cameras = CameraRig(self._rules.render, self.num_envs)
+        self._cameras = CameraRig(self._rules.render, self.num_envs, config.cameras)
         self._place(placement)
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
@@ -105,6 +106,8 @@ class LiberoEnv(SlotBatch):
                 budgets=[self._budget_of(key, scene) for key, scene in zip(keys, scenes, strict=True)],
             )
         self._physics.set_goals([self._goal_table(group) for group in self._physics.groups])
+        if self.config.cameras is not None:
+            self._cameras.names(self.mj_models)  # a camera that does not exist is refused before anything runs
         return np.full(self.num_envs, self._rules.max_steps)
 
     def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:

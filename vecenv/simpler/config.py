@@ -9,6 +9,7 @@ from typing import Any
 
 from vecenv.contract import SUCCESS_MODES
 from vecenv.errors import InvalidInput
+from vecenv.observations import choose_cameras
 from vecenv.protocols import SIMPLER
 from vecenv.protocols import protocol as find_protocol
 from vecenv.simpler.control.servo import ServoConfig
@@ -23,6 +24,8 @@ _NO_CUDA = (
     "spread over processes by num_threads. SAPIEN's GPU physics needs a PhysX library that is no part of its wheel, "
     "and vecenv's scenes, controllers and criteria have not been written or tested for it; a GPU can render the images"
 )
+# LIBERO's name for the third-person camera, which is the only one.
+CAMERAS = ("agentview",)
 GRIPPERS = ("native", "binary")
 OVERLAYS = ("background", "none", "blend")
 
@@ -51,6 +54,7 @@ class SimplerConfig:
         variant: differences from visual matching's scenes; None for none.
         protocol: which episodes there are, one of ``published.PROTOCOLS``: ``"seed"``, 50 of every task, or one of
             upstream's lists, which decide robots, scenes, images and budgets.
+        cameras: the cameras that observations show; ``agentview`` is the only one.
         assets: root of the asset tree; None for where ``vecenv assets pull simpler`` puts it.
     """
 
@@ -64,6 +68,7 @@ class SimplerConfig:
     shadows: bool = False
     variant: Variant | Mapping[str, Any] | None = None
     protocol: str = SEED
+    cameras: list[str] | tuple[str, ...] | None = None
     assets: str | Path | None = None
 
     def __post_init__(self) -> None:
@@ -79,6 +84,8 @@ class SimplerConfig:
         ):
             if getattr(self, name) not in (*allowed, *((None,) if name == "success" else ())):
                 raise SimplerError(f"{name}={getattr(self, name)!r} is not available; available: {', '.join(allowed)}")
+        if self.cameras is not None:
+            object.__setattr__(self, "cameras", choose_cameras(self.cameras, CAMERAS))
         object.__setattr__(self, "variant", make_variant(self.variant))
         if check_protocol(self.protocol) != SEED and self.variant is not None:
             raise SimplerError(f"variant={self.variant}: protocol {self.protocol!r} already decides the variants")

@@ -26,7 +26,7 @@ from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.observations import Egocentric, Objects, Rendered
 from vecenv.simpler import snapshot
 from vecenv.simpler.assets import files as assets
-from vecenv.simpler.config import SimplerConfig, SimplerError
+from vecenv.simpler.config import CAMERAS, SimplerConfig, SimplerError
 from vecenv.simpler.control.controllers import controller
 from vecenv.simpler.control.servo import Servo, ServoConfig
 from vecenv.simpler.episodes import Episode, prepare, require_drawable
@@ -44,8 +44,7 @@ from vecenv.slots import SlotBatch
 
 # Largest action: metres, radians, gripper.
 ACTION_LIMITS = np.array([1.0, 1.0, 1.0, np.pi / 2, np.pi / 2, np.pi / 2, 1.0])
-# LIBERO's name for the third-person camera.
-_CAMERA = "agentview"
+(_CAMERA,) = CAMERAS
 # More objects than any task has.
 _MAX_OBJECTS = 8
 
@@ -130,12 +129,20 @@ class SimplerEnv(SlotBatch):
         return tuple(self._spec(*self._key(slot)) for slot in range(self.num_envs))
 
     def _instruction(self, slot: int) -> str:
-        layout, judge = self._episodes[slot].layout, self._judges[slot]
-        second = judge is not None and judge.second_half(int(self._steps[slot]) + 1)
-        return layout.second_instruction if second else layout.instruction
+        layout = self._episodes[slot].layout
+        return layout.second_instruction if self._in_second_half(slot) else layout.instruction
 
     def _label(self, task: int) -> str:
         return self.tasks[task].name
+
+    @property
+    def second_half(self) -> np.ndarray:
+        """Slots whose next tick belongs to the second half of a task that has two, bool [B]."""
+        return np.array([self._in_second_half(slot) for slot in range(self.num_envs)])
+
+    def _in_second_half(self, slot: int) -> bool:
+        judge = self._judges[slot]
+        return judge is not None and judge.second_half(int(self._steps[slot]) + 1)
 
     def advance_subtask(self, slots: npt.ArrayLike | None = None) -> None:
         """Begin the second half in slots (bool [B], all by default) of tasks that have two."""

@@ -1,1 +1,1 @@
-"""The harness on the command line: ``vecenv eval``, ``vecenv replay`` and ``vecenv bench``, a module each."""
+"""The harness on the command line, a module for each command; ``options`` makes options of the fields of a config."""

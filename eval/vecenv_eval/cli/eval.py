@@ -191,7 +191,7 @@ def print_result(console: Console, result: EvalResult) -> None:
     for line in stand_in_lines(result.summary):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     for cause in result.causes:
-        console.print(f"error in a batch: {cause}", style="red", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"error that ended episodes: {cause}", style="red", markup=False, highlight=False, soft_wrap=True)
     if not result.ok:
         again = f"Episodes lack a verdict; to run them: vecenv eval --resume {result.folder}"
         console.print(again, markup=False, highlight=False, soft_wrap=True)

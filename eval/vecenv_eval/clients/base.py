@@ -74,6 +74,10 @@ class RemotePolicy(Generic[_Config]):
                 self._queues.fill(slot, convert(chunk, self.config.gripper))
         return self._queues.pop(live.tolist())
 
+    def needed_cameras(self) -> Sequence[str]:
+        """Whose images are sent, as far as is known before the server was asked."""
+        return self._cameras()
+
     def close(self) -> None:
         """Close the connections; the next call opens them again."""
 

@@ -200,6 +200,10 @@ class VlaEvalPolicy(RemotePolicy[VlaEvalConfig]):
         if ignored:
             _log.warning("%s asks for %s; the evaluation protocol decides here", self.server, ", ".join(ignored))
 
+    def needed_cameras(self) -> Sequence[str]:
+        """Whose images are sent, as far as is known before the server has said hello."""
+        return ("agentview", "wrist") if self._wrist or self.config.send_wrist_image else ("agentview",)
+
     def _cameras(self) -> Sequence[str]:
         return ("agentview", "wrist") if self._wrist else ("agentview",)
 

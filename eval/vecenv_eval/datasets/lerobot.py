@@ -1,9 +1,9 @@
 """Episodes as a LeRobot dataset (format v3.0), written while a policy runs, for LIBERO and SIMPLER alike.
 
-:class:`LeRobotWriter` is a watcher (``vecenv_eval.watch``): every tick's proprioception, action and images come in; a
-folder that ``lerobot.datasets.LeRobotDataset(repo_id, root=folder)`` reads goes out. Frames hold ``observation.state``,
-``action``, the images under the names LeRobot's own LIBERO datasets use, ``next.done`` and ``next.success``; each
-episode in ``meta/episodes`` also has ``success``, ``suite``, ``task_id`` and ``source_episode``.
+:class:`LeRobotWriter` is an episode recorder (``vecenv_eval.watch``): every tick's proprioception, action and images
+come in; a folder that ``lerobot.datasets.LeRobotDataset(repo_id, root=folder)`` reads goes out. Frames hold
+``observation.state``, ``action``, the images under the names LeRobot's own LIBERO datasets use, ``next.done`` and
+``next.success``; each episode in ``meta/episodes`` also has ``success``, ``suite``, ``task_id`` and ``source_episode``.
 
 Images are encoded as they come, in a file for each episode and camera; the rest is kept until 100 episodes have ended,
 then written. So memory is bounded, and after a crash the dataset is whole and lacks the last episodes at most. Needs
@@ -23,6 +23,7 @@ import numpy as np
 
 from vecenv.contract import ACTION_DIM
 from vecenv.errors import InvalidFile, MissingDependency
+from vecenv.observations import choose_cameras
 from vecenv_eval.datasets.statistics import ImageCounts, Statistics, of_values, together
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store import Record
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 VERSION = "v3.0"
 # Cameras -> features, as in LeRobot's own LIBERO datasets and environment.
 IMAGE_KEYS = {"agentview": "observation.images.image", "wrist": "observation.images.image2"}
+_KEY_OF_OTHERS = "observation.images.{}"
 ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 LIBERO_STATE_NAMES = ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right")
 ROBOTS = {"simpler/bridge": "widowx", "simpler/google_robot": "google_robot"}
@@ -51,6 +53,12 @@ class DatasetError(InvalidFile):
     """A dataset cannot be continued, or an episode does not fit it."""
 
 
+def image_keys(cameras: Sequence[str] = ()) -> dict[str, str]:
+    """Camera -> feature: of these cameras, or of the two of LeRobot's own LIBERO datasets where none is named."""
+    names = choose_cameras(cameras, list(dict.fromkeys((*IMAGE_KEYS, *cameras)))) if cameras else tuple(IMAGE_KEYS)
+    return {name: IMAGE_KEYS.get(name, _KEY_OF_OTHERS.format(name)) for name in names}
+
+
 @dataclass
 class _Rollout:
     """What a slot has done so far."""
@@ -62,7 +70,7 @@ class _Rollout:
 
 
 class LeRobotWriter:
-    """A watcher that writes a LeRobot dataset; one that is there already is continued.
+    """An episode recorder that writes a LeRobot dataset; one that is there already is continued.
 
     Episodes that end in a fault or an error are left out.
 
@@ -90,6 +98,13 @@ class LeRobotWriter:
         self.episodes, self._frames = self._info.get("total_episodes", 0), self._info.get("total_frames", 0)
         self._files = len(list(root.glob("data/*/*.parquet")))
 
+    def begin(self, env: Observable, episodes: Mapping[int, Episode]) -> None:
+        """Drop what there is of these slots: ticks of an episode that never finished."""
+        for slot in episodes:
+            rollout = self._rollouts.pop(slot, None)
+            if rollout is not None:
+                _discard(rollout)
+
     def observe(self, env: Observable, slots: Sequence[int], actions: np.ndarray) -> None:
         """Take down one tick of each slot.
 
@@ -108,20 +123,27 @@ class LeRobotWriter:
             rollout.states.append(np.array(seen.state[slot], np.float32))
             rollout.actions.append(np.array(actions[slot], np.float32))
 
-    def finish(self, slot: int, record: Record) -> None:
-        """Add the episode that ended in a slot to the dataset.
+    def finish(self, env: Observable, records: Mapping[int, Record]) -> None:
+        """Add the episodes that ended to the dataset.
+
+        Args:
+            env: the environment, of which nothing more is observed.
+            records: how the episode in each slot ended.
 
         Raises:
             DatasetError: its state or its images have other shapes than the dataset's.
         """
-        rollout = self._rollouts.pop(slot, None)
-        if rollout is None:
-            return
-        for video in rollout.videos.values():
-            video.close()
+        for slot, record in records.items():
+            rollout = self._rollouts.pop(slot, None)
+            if rollout is not None:
+                self._add_episode(rollout, record)
+
+    def _add_episode(self, rollout: _Rollout, record: Record) -> None:
         if record.fault or record.error:
             _discard(rollout)
             return
+        for video in rollout.videos.values():
+            video.close()
         self._check_features(_features(rollout, self._info["fps"]), record.key, ROBOTS.get(record.suite, "panda"))
         task = self._tasks.setdefault(record.instruction, len(self._tasks))
         videos = {key: video.path for key, video in rollout.videos.items()}
@@ -301,6 +323,7 @@ def _read(root: Path) -> tuple[dict[str, Any], dict[str, int], dict[str, Statist
 
 def _discard(rollout: _Rollout) -> None:
     for video in rollout.videos.values():
+        video.close()
         video.path.unlink()
 
 

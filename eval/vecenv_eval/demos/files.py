@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import vecenv
 from vecenv.errors import InvalidInput
+from vecenv.placement import episode_indices, parse_tasks
 from vecenv_eval.demos.hdf5 import DemoError, Unreadable
 from vecenv_eval.demos.read import read_demos
 from vecenv_eval.demos.schema import SUFFIXES, Demo
@@ -44,3 +46,34 @@ def read_files(
         demos += good
         problems += bad
     return demos, problems
+
+
+def choose(demos: Sequence[Demo], tasks: str | None = None, episodes: str | Sequence[int] | None = None) -> list[Demo]:
+    """Some of the demonstrations.
+
+    Args:
+        demos: what the files hold.
+        tasks: those of these tasks, as for ``vecenv eval``; None for all.
+        episodes: those of these episodes (of LIBERO's own files, with these numbers), likewise.
+
+    Raises:
+        SpecError: the text cannot be parsed, or names tasks that the suite or episodes that the files do not have.
+        ReplayError: nothing is left.
+    """
+    chosen = list(demos)
+    if tasks is not None:
+        wanted = {suite: _tasks(tasks, suite) for suite in {demo.suite for demo in chosen}}
+        chosen = [demo for demo in chosen if demo.task in wanted[demo.suite]]
+    if episodes is not None and chosen:
+        numbers = episode_indices(episodes, 1 + max(demo.number for demo in chosen))
+        chosen = [demo for demo in chosen if demo.number in numbers]
+    if demos and not chosen:
+        asked = {"--tasks": tasks, "--episodes": episodes}
+        text = " ".join(f"{name} {value}" for name, value in asked.items() if value is not None)
+        raise ReplayError(f"{text}: none of the {len(demos)} demonstrations is one of these")
+    return chosen
+
+
+def _tasks(spec: str, suite: str) -> tuple[int, ...]:
+    names = [task.name for task in vecenv.list_tasks(suite)]
+    return parse_tasks(spec, len(names), names)

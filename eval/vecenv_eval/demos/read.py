@@ -6,17 +6,21 @@ demonstration is reported about that one, and the others can still be used.
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 
+import vecenv
 from vecenv.assets import AssetsMissing
 from vecenv.contract import ACTION_DIM
 from vecenv.libero.tasks.suites import NUM_EPISODES, TaskSpec, list_suites, list_tasks
 from vecenv.libero.tasks.suites import task as find_spec
+from vecenv.simpler.published import lists
 from vecenv_eval.demos.hdf5 import (
     DAMAGE,
     DemoError,
@@ -36,6 +40,9 @@ from vecenv_eval.demos.hdf5 import (
 from vecenv_eval.demos.mjcf import fixture_poses
 from vecenv_eval.demos.options import check_options
 from vecenv_eval.demos.schema import Demo, MadeStart, StoredStart
+
+if TYPE_CHECKING:
+    from vecenv.registry import TaskInfo
 
 # Far beyond any demonstration; a file that asks for more is damaged or hostile.
 MAX_TICKS = 100_000
@@ -57,14 +64,14 @@ def read_demos(path: Path, *, suite: str | None = None, task: int | None = None)
     """
     with Opened(path) as file, Errors(path):
         data = member(file, "data", h5py.Group)
-        spec = _find_task(path, data, suite, task)
+        found, spec = _find_task(path, data, suite, task)
         names = sorted((name for name in map(str, data) if _NAME.fullmatch(name)), key=_number)
         if not names:
             raise DemoError("its group 'data' holds no demonstrations (demo_0, demo_1, ...)")
         demos, bad = [], []
         for name in names:
             try:
-                demos.append(_demo(path, data, name, spec))
+                demos.append(_demo(path, data, name, found, spec))
             except AssetsMissing:
                 raise
             except DAMAGE as error:
@@ -76,7 +83,7 @@ def _number(name: str) -> tuple[int, str]:
     return int("".join(filter(str.isdecimal, name))), name
 
 
-def _demo(path: Path, data: h5py.Group, name: str, spec: TaskSpec) -> Demo:
+def _demo(path: Path, data: h5py.Group, name: str, suite: str, spec: TaskInfo) -> Demo:
     group = member(data, name, h5py.Group)
     actions = _actions(group)
     if "states" in group:
@@ -84,11 +91,13 @@ def _demo(path: Path, data: h5py.Group, name: str, spec: TaskSpec) -> Demo:
     return Demo(
         path=path,
         name=name,
-        suite=spec.suite,
+        suite=suite,
         task=spec.index,
-        start=_made_start(group) if "make" in group.attrs else _stored_start(group, spec, len(actions)),
+        start=_start(group, suite, spec, len(actions)),
         actions=actions,
         success=_verdict(group, len(actions)),
+        second_half=_second_half(group, len(actions)),
+        stand_ins=_stand_ins(group),
     )
 
 
@@ -121,6 +130,36 @@ def _verdict(group: h5py.Group, ticks: int) -> bool | None:
     return None
 
 
+def _second_half(group: h5py.Group, ticks: int) -> np.ndarray | None:
+    """Our own ``second_half``: which actions belong to the second half of a task that has two."""
+    if "second_half" not in group:
+        return None
+    dataset = numeric_dataset(group, "second_half")
+    if dataset.shape != (ticks,):
+        raise DemoError(f"second_half: expected one number an action, [{ticks}], got {shape_text(dataset.shape)}")
+    return np.asarray(dataset[()]) > 0
+
+
+def _stand_ins(group: h5py.Group) -> tuple[str, ...] | None:
+    """Our own ``stand_ins``; None where there is none."""
+    text = text_attribute(group, "stand_ins")
+    try:
+        value = None if text is None else json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise DemoError(f"attribute stand_ins: not JSON: {error}") from None
+    if value is not None and not (isinstance(value, list) and all(isinstance(each, str) for each in value)):
+        raise DemoError("attribute stand_ins: expected a JSON list of texts")
+    return None if value is None else tuple(value)
+
+
+def _start(group: h5py.Group, suite: str, spec: TaskInfo, ticks: int) -> MadeStart | StoredStart:
+    if "make" in group.attrs:
+        return _made_start(group, suite, spec)
+    if not isinstance(spec, TaskSpec):
+        raise DemoError(f"it has no attribute make, which says where an episode of {suite} begins")
+    return _stored_start(group, spec, ticks)
+
+
 def _stored_start(group: h5py.Group, spec: TaskSpec, ticks: int) -> StoredStart:
     if "init_state" in group.attrs:
         name, state = "init_state", vector_attribute(group, "init_state")
@@ -135,19 +174,40 @@ def _stored_start(group: h5py.Group, spec: TaskSpec, ticks: int) -> StoredStart:
     return StoredStart(state=require_finite(name, state), fixtures=None if text is None else fixture_poses(text, spec))
 
 
-def _made_start(group: h5py.Group) -> MadeStart:
+def _made_start(group: h5py.Group, suite: str, spec: TaskInfo) -> MadeStart:
     options = json_attribute(group, "make")
-    check_options(options)
+    check_options(options, suite)
+    count = NUM_EPISODES if isinstance(spec, TaskSpec) else _num_episodes(options, spec)
     episode = group.attrs.get("episode")
-    if not isinstance(episode, int | np.integer) or not 0 <= episode < NUM_EPISODES:
-        raise DemoError(f"attribute episode: expected 0 to {NUM_EPISODES - 1}, got {episode!r:.50}")
+    if not isinstance(episode, int | np.integer) or not 0 <= episode < count:
+        raise DemoError(f"attribute episode: expected 0 to {count - 1}, got {episode!r:.50}")
     return MadeStart(episode=int(episode), options=options)
 
 
-def _find_task(path: Path, data: h5py.Group, suite: str | None, task: int | None) -> TaskSpec:
+def _num_episodes(options: Mapping[str, Any], spec: TaskInfo) -> int:
+    """How many episodes SIMPLER has of a task under the protocol of a recording."""
+    protocol = options.get("protocol", lists.SEED)
+    try:
+        count = lists.num_episodes(protocol, spec.name)
+    except lists.PublishedError as error:
+        raise DemoError(f"attribute make: {error}") from None
+    if not count:
+        raise DemoError(f"attribute make: protocol {protocol!r} has no episodes of {spec.name}")
+    return count
+
+
+def _find_task(path: Path, data: h5py.Group, suite: str | None, task: int | None) -> tuple[str, TaskInfo]:
     """The task asked for; else the one the file names; else the one named as its task file or the file is."""
-    if suite is None and task is None and "suite" in data.attrs:
-        return _named_task(text_attribute(data, "suite"), data.attrs.get("task"))
+    if "suite" in data.attrs and ((suite is None and task is None) or vecenv.family(suite or "") != "libero"):
+        return _named_task(text_attribute(data, "suite"), data.attrs.get("task"), suite, task)
+    spec = _find_spec(path, data, suite, task)
+    return spec.suite, spec
+
+
+def _find_spec(path: Path, data: h5py.Group, suite: str | None, task: int | None) -> TaskSpec:
+    """LIBERO's task asked for, or named as the file's task file or the file is."""
+    if suite is not None and suite not in list_suites():
+        raise DemoError(f"it does not say which task of which suite it demonstrates, as recordings of {suite} do")
     if suite is not None and task is not None:
         return find_spec(suite, task)
     files = list(_task_files(path, data))
@@ -163,13 +223,19 @@ def _find_task(path: Path, data: h5py.Group, suite: str | None, task: int | None
     )
 
 
-def _named_task(suite: str | None, task: object) -> TaskSpec:
-    if suite not in list_suites():
-        raise DemoError(f"attribute suite: {suite!r:.50} is none of {', '.join(list_suites())}")
-    specs = list_tasks(suite)
+def _named_task(
+    suite: str | None, task: object, wanted_suite: str | None, wanted_task: int | None
+) -> tuple[str, TaskInfo]:
+    """The task that a file names, which is the one asked for, if one is."""
+    if suite is None or suite not in vecenv.list_suites():
+        raise DemoError(f"attribute suite: {suite!r:.50} is none of {', '.join(vecenv.list_suites())}")
+    specs = vecenv.list_tasks(suite)
     if not isinstance(task, int | np.integer) or not 0 <= task < len(specs):
         raise DemoError(f"attribute task: expected 0 to {len(specs) - 1}, got {task!r:.50}")
-    return specs[int(task)]
+    if wanted_suite not in (None, suite) or wanted_task not in (None, int(task)):
+        asked = f"{wanted_suite or suite}{'' if wanted_task is None else f' task {wanted_task}'}"
+        raise DemoError(f"it demonstrates {suite} task {task}, not {asked}")
+    return suite, specs[int(task)]
 
 
 def _task_files(path: Path, data: h5py.Group) -> Iterable[Path]:

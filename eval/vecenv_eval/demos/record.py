@@ -1,14 +1,14 @@
 """Recording what an evaluation executes, so that ``vecenv replay`` can do it again.
 
-A freshly reset batch comes in; while :class:`Recorder` listens, every control tick is noted: which slots moved and with
-which actions, whatever verb the policy used. When the batch ends, each finished slot becomes a
-:class:`~vecenv_eval.demos.schema.Recording`.
+:class:`DemoRecorder` is an episode recorder (``vecenv_eval.watch``): every control tick is noted, whichever verb the
+policy used: which slots moved, and with which actions. Each episode that ends becomes a
+:class:`~vecenv_eval.demos.schema.Recording`, which is kept at once (``vecenv_eval.sink``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,95 +17,130 @@ import numpy.typing as npt
 from vecenv.contract import BatchEnv, State
 from vecenv.errors import InvalidFile
 from vecenv_eval.demos.schema import Recording
+from vecenv_eval.episodes import Episode
+from vecenv_eval.store import Record
 
 
 class RecordError(InvalidFile):
     """An environment whose executed actions cannot be seen."""
 
 
-class Recorder:
-    """Notes what a batch executes; memory grows by 56 bytes a slot and tick, with states by 8 (1 + nq + nv) more.
+@dataclass
+class _Rollout:
+    """What a slot has executed so far; a second half is a task's, where SIMPLER's tasks have two."""
+
+    start: np.ndarray
+    actions: list[np.ndarray] = field(default_factory=list)
+    states: list[np.ndarray] = field(default_factory=list)
+    second_half: list[bool] = field(default_factory=list)
+
+
+class DemoRecorder:
+    """Writes what every episode executes.
+
+    Memory grows by 56 bytes a slot and tick, with states by 8 (1 + nq + nv) more, until the episode ends.
 
     Args:
-        env: the batch, just reset.
-        episodes: episode index of each slot.
+        keep: called with suite, task, instruction and episodes of it, which it has written when it returns.
+        instructions: of each task of the suite.
         options: what ``vecenv.make`` was called with, see ``vecenv_eval.demos.options.make_options``.
         states: also keep the state before every tick.
-
-    Raises:
-        RecordError: the environment does not show what it executes.
     """
 
     def __init__(
-        self, env: BatchEnv, episodes: Sequence[int], options: Mapping[str, Any], *, states: bool = False
+        self,
+        keep: Callable[[str, int, str, Sequence[Recording]], None],
+        instructions: Sequence[str],
+        options: Mapping[str, Any],
+        *,
+        states: bool = False,
     ) -> None:
-        self._env, self._options, self._with_states = env, options, states
-        self._episodes = list(episodes)
-        count = len(self._episodes)
-        self._actions: list[list[np.ndarray]] = [[] for _ in range(count)]
-        self._states: list[list[np.ndarray]] = [[] for _ in range(count)]
+        self._keep, self._instructions, self._options, self._with_states = keep, instructions, options, states
+        self._env: BatchEnv | None = None
+        self._rollouts: dict[int, _Rollout] = {}
+
+    def begin(self, env: BatchEnv, episodes: Mapping[int, Episode]) -> None:
+        """Note the state that episodes begin in; what was noted of these slots before is dropped.
+
+        Raises:
+            RecordError: the environment does not show what it executes.
+        """
+        if env is not self._env:
+            self._env, self._rollouts = env, {}
         try:
             state = env.state()
         except AttributeError as error:
             what = f"{type(env).__name__} does not show the actions it executes, so it cannot be recorded"
             raise RecordError(what) from error
-        self._start = [flat_state(state, slot) for slot in range(count)]
-        self._ended: dict[int, tuple[bool, str, np.ndarray]] = {}
+        self._rollouts |= {slot: _Rollout(flat_state(state, slot)) for slot in episodes}
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """While inside, control ticks are noted."""
-        with self._env.watched(self._note):
-            yield
-
-    def _note(self, actions: np.ndarray, active: np.ndarray) -> None:
+    def observe(self, env: object, slots: Sequence[int], actions: np.ndarray) -> None:
+        """Note one tick of each slot, before it happens; slots whose beginning was not seen are passed over."""
+        del env  # what is shared with other recorders has images, and no states
+        assert self._env is not None, "call begin() first"
         state = self._env.state() if self._with_states else None
-        for slot in np.flatnonzero(active).tolist():
-            self._actions[slot].append(np.array(actions[slot], float))
+        halves = second_halves(self._env)
+        for slot in self._rollouts.keys() & set(slots):
+            rollout = self._rollouts[slot]
+            rollout.actions.append(np.array(actions[slot], float))
             if state is not None:
-                self._states[slot].append(flat_state(state, slot))
+                rollout.states.append(flat_state(state, slot))
+            if halves is not None:
+                rollout.second_half.append(bool(halves[slot]))
 
-    def begin(self, slots: Sequence[int], episodes: Sequence[int]) -> None:
-        """Other episodes have begun in some slots, which were just reset; what they had recorded is dropped."""
-        state = self._env.state()
-        for slot, episode in zip(slots, episodes, strict=True):
-            self._episodes[slot], self._start[slot] = episode, flat_state(state, slot)
-            self._actions[slot], self._states[slot] = [], []
-            self._ended.pop(slot, None)
+    def finish(self, env: BatchEnv, records: Mapping[int, Record]) -> None:
+        """Write the episodes that ended; one whose physics failed before its first tick has nothing to record."""
+        state = env.state()
+        by_task: dict[tuple[str, int], list[Recording]] = {}
+        for slot, record in records.items():
+            rollout = self._rollouts.pop(slot, None)
+            if rollout is not None and rollout.actions and not record.error:
+                recording = self._recording(env, slot, rollout, record, flat_state(state, slot))
+                by_task.setdefault((record.suite, record.task), []).append(recording)
+        for (suite, task), recordings in by_task.items():
+            self._keep(suite, task, self._instructions[task], recordings)
 
-    def finish(self, finished: np.ndarray, success: np.ndarray, faults: Sequence[str]) -> None:
-        """Note the verdicts of the slots that the last call finished: bool [B], bool [B], B strings."""
-        state = self._env.state()
-        for slot in np.flatnonzero(finished).tolist():
-            self._ended[slot] = (bool(success[slot]), faults[slot], flat_state(state, slot))
+    def close(self) -> None:
+        """Drop the episodes that have not finished."""
+        self._env, self._rollouts = None, {}
 
-    def recordings(self) -> dict[int, Recording]:
-        """The slots that have finished; one whose physics failed before its first tick has nothing to record."""
-        return {
-            slot: Recording(
-                episode=self._episodes[slot],
-                success=success,
-                fault=fault,
-                actions=np.stack(self._actions[slot]),
-                init_state=self._start[slot],
-                final_state=final,
-                states=np.array(self._states[slot]) if self._with_states else None,
-                options=_of_slot(self._options, slot),
-            )
-            for slot, (success, fault, final) in self._ended.items()
-            if self._actions[slot]
-        }
-
-    def take(self) -> dict[int, Recording]:
-        """``recordings``, which are then forgotten."""
-        taken = self.recordings()
-        self._ended.clear()
-        return taken
+    def _recording(
+        self, env: BatchEnv, slot: int, rollout: _Rollout, record: Record, final_state: np.ndarray
+    ) -> Recording:
+        return Recording(
+            episode=record.episode,
+            success=record.success,
+            fault=record.fault,
+            actions=np.stack(rollout.actions),
+            init_state=rollout.start,
+            final_state=final_state,
+            states=np.array(rollout.states) if self._with_states else None,
+            second_half=np.array(rollout.second_half) if any(rollout.second_half) else None,
+            options=_of_slot(self._options, slot),
+            instruction=record.instruction,
+            labels=_labels(env, slot),
+            stand_ins=record.stand_ins,
+        )
 
 
 def flat_state(state: State, slot: int) -> np.ndarray:
     """A slot's time, qpos and qvel in one row, [1 + nq + nv]."""
     return np.concatenate([state.time[[slot]], state.qpos[slot, : state.nq[slot]], state.qvel[slot, : state.nv[slot]]])
+
+
+def second_halves(env: BatchEnv) -> np.ndarray | None:
+    """Which slots are in the second half of a task that has two, bool [B]; None where no task has halves."""
+    return getattr(env, "second_half", None)
+
+
+def _labels(env: BatchEnv, slot: int) -> dict[str, str | int]:
+    """What identifies an episode for a reader, beyond its number; a replay needs none of it."""
+    specs = getattr(env, "specs", None)  # SIMPLER's environments have the rows of the published lists
+    if specs is None:
+        protocol = getattr(env.config, "protocol", None)
+        return {} if protocol is None else {"protocol": protocol}
+    spec = specs[slot]
+    return {"protocol": spec.protocol, "task_name": spec.task, "setting": spec.setting, "seed": spec.seed}
 
 
 def _of_slot(options: Mapping[str, Any], slot: int) -> dict[str, Any]:

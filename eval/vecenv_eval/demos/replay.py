@@ -8,22 +8,28 @@ stepped tick by tick with their own actions, and judged at or before their own l
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 import vecenv
 from vecenv.assets import AssetsMissing
-from vecenv.contract import ACTION_DIM, Control
-from vecenv.libero.env import LiberoEnv
+from vecenv.contract import ACTION_DIM, BatchEnv, Control
+from vecenv_eval.demos.files import ReplayError
 from vecenv_eval.demos.hdf5 import DemoError, Unreadable
 from vecenv_eval.demos.outcomes import Outcome, ReplayReport
-from vecenv_eval.demos.record import flat_state
+from vecenv_eval.demos.record import flat_state, second_halves
 from vecenv_eval.demos.schema import Demo, MadeStart, StoredStart
+from vecenv_eval.store import Record
+from vecenv_eval.watch import EpisodeRecorder, watching
 
 NO_FIXTURES = "no model_file: fixtures at their centres"
+OTHER_FILES = "other asset files are missing here than on record"
+# Options of ``vecenv.make`` that the demonstrations themselves decide.
+_NOT_REPLACED = frozenset({"tasks", "episodes", "max_steps", "gripper"})
+_NOT_REPLACED_BECAUSE = "a demonstration decides which episode it is, how long it is, and how its gripper is commanded"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +38,7 @@ class ReplayConfig:
 
     Attributes:
         backend: physics backend; None for the one on record, ``native`` where there is none.
+        options: further options of ``vecenv.make``, in place of those on record.
         num_envs: most demonstrations that run at once.
         num_threads: threads of the physics, None for the backend's own choice.
         contacts: ``"published"`` or ``"current"``; None for those on record, published where there are none.
@@ -39,8 +46,31 @@ class ReplayConfig:
 
     backend: str | None = None
     contacts: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
     num_envs: int = 256
     num_threads: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in _NOT_REPLACED & self.options.keys():
+            raise ReplayError(f"option {name}={self.options[name]!r}: {_NOT_REPLACED_BECAUSE}")
+
+    @property
+    def replacing(self) -> dict[str, Any]:
+        """The options that hold in place of those on record.
+
+        Raises:
+            OptionError: see ``check_suite``.
+        """
+        own = {name: getattr(self, name) for name in ("backend", "contacts", "num_threads")}
+        return {**self.options, **{name: value for name, value in own.items() if value is not None}}
+
+    def check_suite(self, suite: str) -> None:
+        """Refuse options that demonstrations of a suite cannot be replayed with.
+
+        Raises:
+            OptionError: the suite does not have the option, or not this value; other ``VecenvError`` likewise.
+        """
+        vecenv.make_config(suite, self.replacing)
 
 
 def replay(
@@ -48,6 +78,7 @@ def replay(
     config: ReplayConfig | None = None,
     *,
     on_batch: Callable[[str], None] = lambda text: None,
+    recorders: Sequence[EpisodeRecorder] = (),
 ) -> ReplayReport:
     """Execute demonstrations again, in as few batches as their starts allow.
 
@@ -55,6 +86,7 @@ def replay(
         demos: what to replay.
         config: how.
         on_batch: called with one line about each batch, before it runs.
+        recorders: see the demonstrations as episodes that run; whoever made them closes them.
 
     Returns:
         Outcomes in the order of ``demos``. What the simulator refuses to place is a problem of that batch alone.
@@ -68,7 +100,7 @@ def replay(
         on_batch(f"batch {number}/{len(batches)}: {len(batch)} demonstrations of up to {longest} ticks")
         chosen = [demos[i] for i in batch]
         try:
-            outcomes.update(zip(batch, _replay_batch(chosen, config), strict=True))
+            outcomes.update(zip(batch, _replay_batch(chosen, config, recorders), strict=True))
         except AssetsMissing:
             raise
         except (ValueError, KeyError, IndexError, TypeError, RuntimeError) as error:
@@ -98,7 +130,7 @@ def _start_key(start: StoredStart | MadeStart) -> Hashable:
     return None if start.fixtures is None else frozenset(start.fixtures)
 
 
-def _make(demos: Sequence[Demo], config: ReplayConfig) -> LiberoEnv:
+def _make(demos: Sequence[Demo], config: ReplayConfig) -> BatchEnv:
     """The environment with one slot a demonstration, reset and in the start states."""
     stored = [demo.start for demo in demos if isinstance(demo.start, StoredStart)]
     made = [demo.start for demo in demos if isinstance(demo.start, MadeStart)]  # one list is empty: see _start_key
@@ -106,12 +138,8 @@ def _make(demos: Sequence[Demo], config: ReplayConfig) -> LiberoEnv:
     episodes: dict[int, list[int]] = {}
     for demo in demos:
         episodes.setdefault(demo.task, []).append(demo.start.episode if isinstance(demo.start, MadeStart) else 0)
-    options |= {"max_steps": max(map(len, demos)), "num_threads": config.num_threads}
-    for name in ("backend", "contacts"):
-        if getattr(config, name) is not None:
-            options[name] = getattr(config, name)
+    options |= {**config.replacing, "max_steps": max(map(len, demos))}
     env = vecenv.make(demos[0].suite, tasks=list(episodes), episodes=episodes, **options)
-    assert isinstance(env, LiberoEnv)  # demonstrations are of LIBERO's suites
     try:
         env.reset()
         if stored:
@@ -133,29 +161,32 @@ def _stored_options(starts: Sequence[StoredStart]) -> dict[str, Any]:
     return options
 
 
-def _load(env: LiberoEnv, starts: Sequence[StoredStart]) -> None:
+def _load(env: BatchEnv, starts: Sequence[StoredStart]) -> None:
     """Put each slot into its stored state; the controller keeps its memory of the reset, as upstream's does."""
     state = env.state()
     qpos, qvel, time = state.qpos.copy(), state.qvel.copy(), state.time.copy()
     for slot, start in enumerate(starts):
         nq, nv = state.nq[slot], state.nv[slot]
         time[slot], qpos[slot, :nq], qvel[slot, :nv] = start.state[0], start.state[1 : 1 + nq], start.state[1 + nq :]
-    env.set_state(qpos=qpos, qvel=qvel, time=time)
+    env.set_state(replace(state, qpos=qpos, qvel=qvel, time=time))
 
 
 # -- stepping ----------------------------------------------------------------------------------------------------------
 
 
-def _replay_batch(demos: Sequence[Demo], config: ReplayConfig) -> list[Outcome]:
+def _replay_batch(demos: Sequence[Demo], config: ReplayConfig, recorders: Sequence[EpisodeRecorder]) -> list[Outcome]:
     env = _make(demos, config)
     try:
-        return _step_through(env, demos)
+        for recorder in recorders:
+            recorder.begin(env, {slot: demo.key for slot, demo in enumerate(demos)})
+        with watching(env, recorders):
+            return _step_through(env, demos, recorders)
     finally:
         env.close()
 
 
-def _step_through(env: LiberoEnv, demos: Sequence[Demo]) -> list[Outcome]:
-    """Step until every demonstration has been judged; one that has ended idles beside the others."""
+def _step_through(env: BatchEnv, demos: Sequence[Demo], recorders: Sequence[EpisodeRecorder]) -> list[Outcome]:
+    """Step until every demonstration has been judged; a slot that was judged does not move any more."""
     lengths = np.array([len(demo) for demo in demos])
     outcomes: list[Outcome | None] = [None] * len(demos)
     nq = env.state().nq
@@ -165,14 +196,31 @@ def _step_through(env: LiberoEnv, demos: Sequence[Demo]) -> list[Outcome]:
         if not waiting.any():
             break
         before |= _states(env, waiting & (lengths == tick + 1))
+        _begin_second_halves(env, demos, tick)
         control = env.step_continuous(_actions(demos, tick))
         judged = waiting & (control.done | (lengths == tick + 1))
         for slot, after in _states(env, judged).items():
             outcomes[slot] = _outcome(demos[slot], control, slot, nq[slot], before.pop(slot, None), after)
+        if judged.any():
+            records = {slot: _record(env, demos[slot], control, slot) for slot in np.flatnonzero(judged).tolist()}
+            for recorder in recorders:
+                recorder.finish(env, records)
+            env.end_episodes(judged)
     return [outcome for outcome in outcomes if outcome is not None]
 
 
-def _states(env: LiberoEnv, chosen: np.ndarray) -> dict[int, np.ndarray]:
+def _begin_second_halves(env: BatchEnv, demos: Sequence[Demo], tick: int) -> None:
+    """Begin the second half of a SIMPLER task at the tick at which it began on record."""
+    begins = [demo.second_half is not None and tick < len(demo) and bool(demo.second_half[tick]) for demo in demos]
+    begun = second_halves(env) if any(begins) else None
+    if begun is not None and (begins & ~begun).any():
+        from vecenv.simpler.env import SimplerEnv
+
+        assert isinstance(env, SimplerEnv)  # only its tasks have halves
+        env.advance_subtask(begins & ~begun)
+
+
+def _states(env: BatchEnv, chosen: np.ndarray) -> dict[int, np.ndarray]:
     if not chosen.any():
         return {}
     state = env.state()
@@ -194,6 +242,9 @@ def _outcome(demo: Demo, control: Control, slot: int, nq: int, before: np.ndarra
     """The outcome of a slot that has just been judged, with its states before and after its last action."""
     ticks = int(control.step_index[slot])
     notes = [NO_FIXTURES] if isinstance(demo.start, StoredStart) and demo.start.fixtures is None else []
+    missing = control.info["stand_ins"][slot] if "stand_ins" in control.info else ()
+    if demo.stand_ins is not None and set(demo.stand_ins) != set(missing):
+        notes.append(OTHER_FILES)
     try:
         difference = _difference(demo, ticks, before, after)
     except DemoError as error:
@@ -212,6 +263,24 @@ def _outcome(demo: Demo, control: Control, slot: int, nq: int, before: np.ndarra
         qvel_error=None if difference is None else float(difference[1 + nq :].max()),
         fault=control.info["fault"][slot],
         note="; ".join(notes),
+    )
+
+
+def _record(env: BatchEnv, demo: Demo, control: Control, slot: int) -> Record:
+    """How the demonstration in a slot went, for recorders."""
+    metrics = env.evaluate()
+    return Record(
+        suite=demo.suite,
+        task=demo.task,
+        episode=demo.number,
+        instruction=env.instructions()[slot],
+        success=bool(control.success[slot]),
+        success_first=bool(metrics.success_first[slot]),
+        success_final=bool(metrics.success_final[slot]),
+        num_steps=int(control.step_index[slot]),
+        reward=float(metrics.cumulative_reward[slot]),
+        fault=control.info["fault"][slot],
+        parts=dict(control.info["parts"][slot]) if "parts" in control.info else {},
     )
 
 

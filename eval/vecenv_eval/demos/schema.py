@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 
 from vecenv_eval.demos.hdf5 import Errors, Opened, member, require_finite, states_dataset, vector_attribute
+from vecenv_eval.episodes import Episode
 
 SUFFIXES = (".hdf5", ".h5")
 
@@ -54,6 +55,8 @@ class Demo:
         start: where it begins.
         actions: float64 [T, 7], finite.
         success: the verdict on record, None where there is none.
+        second_half: of a SIMPLER task in two halves, whether each action belongs to the second, bool [T]; else None.
+        stand_ins: what missing files were replaced by when it was recorded; None where that is not on record.
     """
 
     path: Path
@@ -63,9 +66,23 @@ class Demo:
     start: StoredStart | MadeStart
     actions: np.ndarray
     success: bool | None
+    second_half: np.ndarray | None = None
+    stand_ins: tuple[str, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    @property
+    def number(self) -> int:
+        """The episode on record; else the demonstration's number in its file."""
+        if isinstance(self.start, MadeStart):
+            return self.start.episode
+        return int("".join(filter(str.isdecimal, self.name)))
+
+    @property
+    def key(self) -> Episode:
+        """Which episode it is."""
+        return Episode(self.suite, self.task, self.number)
 
     def recorded_state(self, ticks: int) -> np.ndarray | None:
         """The state on record after so many ticks: time, qpos, qvel, [1 + nq + nv]; None where there is none.
@@ -93,7 +110,12 @@ class Recording:
         actions: what was executed, [T, 7].
         init_state, final_state: before the first and after the last action, [1 + nq + nv].
         states: before each action, [T, 1 + nq + nv], or None.
+        second_half: of a SIMPLER task in two halves, whether each action belongs to the second, bool [T]; None where
+            none does.
         options: keyword arguments of ``vecenv.make``, see ``make_options``; plain JSON types.
+        instruction: what the policy was told.
+        labels: what else identifies the episode, such as its protocol; for readers.
+        stand_ins: what missing files were replaced by.
     """
 
     episode: int
@@ -103,4 +125,8 @@ class Recording:
     init_state: np.ndarray
     final_state: np.ndarray
     states: np.ndarray | None = None
+    second_half: np.ndarray | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    instruction: str = ""
+    labels: Mapping[str, str | int] = field(default_factory=dict)
+    stand_ins: tuple[str, ...] = ()

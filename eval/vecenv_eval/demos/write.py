@@ -1,4 +1,4 @@
-"""Recordings written to HDF5 files in LIBERO's layout."""
+"""Recordings written to HDF5 files in LIBERO's layout; SIMPLER's have no BDDL file, and the name of their task."""
 
 from __future__ import annotations
 
@@ -52,6 +52,10 @@ def _describe(data: h5py.Group, suite: str, task: int, instruction: str) -> None
         spec = list_tasks(suite)[task]
         problem |= {"problem_name": spec.problem().name, "domain_name": "robosuite"}
         data.attrs["bddl_file_name"] = f"bddl_files/{suite}/{spec.name}.bddl"
+    elif suite in vecenv.list_suites("simpler"):
+        name = vecenv.list_tasks(suite)[task].name
+        problem |= {"problem_name": name, "domain_name": "simpler"}
+        data.attrs["task_name"] = name
     data.attrs["problem_info"] = json.dumps(problem)
     data.attrs["suite"], data.attrs["task"], data.attrs["vecenv_version"] = suite, task, vecenv.__version__
 
@@ -67,7 +71,10 @@ def _write_demo(data: h5py.Group, recording: Recording) -> None:
     group["dones"], group["rewards"] = last, last * np.uint8(recording.success)
     if recording.states is not None:
         group.create_dataset("states", data=recording.states, compression="gzip", compression_opts=1)
+    if recording.second_half is not None:
+        group["second_half"] = recording.second_half.astype(np.uint8)
     group.attrs.update(
+        **recording.labels,
         num_samples=ticks,
         init_state=recording.init_state,
         final_state=recording.final_state,
@@ -75,4 +82,6 @@ def _write_demo(data: h5py.Group, recording: Recording) -> None:
         fault=recording.fault,
         episode=recording.episode,
         make=json.dumps(recording.options),
+        instruction=recording.instruction,
+        stand_ins=json.dumps(recording.stand_ins),
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
@@ -56,6 +56,15 @@ class Policy(Protocol):
             Actions for ``step_continuous``, [B, 7] or a chunk [B, K, 7] (rows of finished slots are ignored); or, from
             a policy that stepped the environment itself (with ``step_ee_pose``, for example), the ``Control`` it got.
         """
+        ...
+
+
+@runtime_checkable
+class Seeing(Protocol):
+    """A policy that says whose images it reads, so that a run without them is refused before it begins; optional."""
+
+    def needed_cameras(self) -> Sequence[str]:
+        """Names of the cameras, by which it reads ``observe_egocentric().images``."""
         ...
 
 

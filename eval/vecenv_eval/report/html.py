@@ -21,6 +21,7 @@ from vecenv_eval.report.compare import compare
 from vecenv_eval.report.findings import conditions, last_actions, plain, video_of, warnings
 from vecenv_eval.report.run import Run, SuiteRun
 from vecenv_eval.report.summary import Row
+from vecenv_eval.report.tables import PARTS, part_cells
 from vecenv_eval.store import Record
 
 TEMPLATE = "page.html.j2"
@@ -77,7 +78,7 @@ def page(run: Run, other: Run | None = None, *, out: Path, embed_mb: float = EMB
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"percent": _percent, "interval": _interval, "plain": plain}
+    environment.filters |= {"percent": _percent, "interval": _interval, "plain": plain, "part_cells": part_cells}
     views = _views(run, out.parent, embed_mb)
     failed = [view for view in views if view.outcome != "solved"]
     return environment.get_template(TEMPLATE).render(
@@ -88,6 +89,7 @@ def page(run: Run, other: Run | None = None, *, out: Path, embed_mb: float = EMB
         versions=_versions(run),
         failed=failed[:MOST_SHOWN],
         hidden=len(failed) - len(failed[:MOST_SHOWN]),
+        parts_title=PARTS,
         solved=[view for view in views if view.outcome == "solved"],
         final="final" in {suite.settings("conditions").get("success") for suite in run.suites},
         comparison=None if other is None else compare(run, other),

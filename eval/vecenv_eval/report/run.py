@@ -198,8 +198,17 @@ def _check(record: Record, folder: Path) -> None:
         for name in names:
             if not isinstance(value := getattr(record, name), kind):
                 raise StoreError(f"{folder}: {name} of episode {record.key.id} is {value!r:.50}, not {what}")
+    if not _are_parts(record.parts):
+        raise StoreError(f"{folder}: parts of episode {record.key.id} is {record.parts!r:.50}, not names and numbers")
     if min(record.task, record.episode, record.num_steps) < 0 or record.task > 100_000:
         raise StoreError(f"{folder}: episode {record.key.id} with {record.num_steps} steps cannot be")
+
+
+def _are_parts(value: object) -> bool:
+    """Whether a value maps names to true, false, numbers or nothing."""
+    if not isinstance(value, Mapping):
+        return False
+    return all(isinstance(name, str) and isinstance(each, int | float | None) for name, each in value.items())
 
 
 def _stored_rows(folder: Path) -> dict[int, Mapping[str, Any]] | None:

@@ -1,8 +1,8 @@
 """From episode records to numbers: success rates with Wilson 95 % intervals, by task and for the suite.
 
 Records come in, a :class:`Summary` goes out, ready for JSON; ``tables`` writes it for the screen and for documents.
-A faulted episode counts as a failure. An episode whose batch raised an error has no verdict: it is left out of the rate
-and counted beside it, as is one that never ran.
+A faulted episode counts as a failure. An episode that an error ended has no verdict: it is left out of the rate and
+counted beside it, as is one that never ran.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Row:
         low, high: Wilson 95 % interval of the rate, None without episodes.
         steps_to_solve: mean control ticks of solved episodes, None without any.
         faults: episodes whose slot was quarantined; they count as failures.
-        errors: episodes without a verdict because their batch raised.
+        errors: episodes without a verdict, because an error ended them.
         missing: episodes that were planned and never ran.
     """
 
@@ -55,6 +55,27 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PartRow:
+    """One intermediate result of a task's success check (``Record.parts``), over the task's episodes.
+
+    Attributes:
+        task: task index.
+        name: upstream's name of it.
+        episodes: episodes with a verdict that have it.
+        held: those in which it held after the last tick; None for a number.
+        share: held / episodes; None for a number.
+        mean: mean of a number after the last tick; None for what holds or does not.
+    """
+
+    task: int
+    name: str
+    episodes: int
+    held: int | None
+    share: float | None
+    mean: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Summary:
     """An evaluation in numbers.
 
@@ -70,6 +91,7 @@ class Summary:
             often each text was reported.
         stand_ins: how many episodes ran with what in place of a missing file.
         conditions: what the episodes ran under, see ``vecenv_eval.conditions``; empty when no environment was made.
+        parts: the intermediate results of the success check, task by task; SIMPLER's tasks have some.
     """
 
     suite: str
@@ -83,6 +105,7 @@ class Summary:
     extras: Mapping[str, float | dict[str, int]] = field(default_factory=dict)
     stand_ins: Mapping[str, int] = field(default_factory=dict)
     conditions: Mapping[str, Any] = field(default_factory=dict)
+    parts: tuple[PartRow, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -145,6 +168,7 @@ def summarise(
         extras=_extras(found),
         stand_ins=dict(Counter(note for record in found for note in record.stand_ins).most_common()),
         conditions=conditions or {},
+        parts=tuple(part for task in tasks for part in _parts(task, [r for r in found if r.task == task])),
     )
 
 
@@ -180,11 +204,27 @@ def _extras(records: Sequence[Record]) -> dict[str, float | dict[str, int]]:
     return result
 
 
+def _parts(task: int, records: Sequence[Record]) -> list[PartRow]:
+    """What the success check found on the way, over the episodes of a task that have a verdict."""
+    verdicts = [record.parts for record in records if not record.error]
+    rows = []
+    for name in dict.fromkeys(name for parts in verdicts for name in parts):
+        values = [parts[name] for parts in verdicts if parts.get(name) is not None]
+        if values and all(isinstance(value, bool) for value in values):
+            held = sum(map(bool, values))
+            share, mean = held / len(values), None
+        else:
+            held = share = None
+            mean = sum(map(float, values)) / len(values) if values else None
+        rows.append(PartRow(task=task, name=name, episodes=len(values), held=held, share=share, mean=mean))
+    return rows
+
+
 def _seconds(records: Sequence[Record]) -> tuple[float, float]:
     """Seconds of setup and of running.
 
     Slots that are placed together note the same setup. Shares of policy, physics and images add up to the time of
-    running; of a batch without them, the time is that until its last episode ended.
+    running; of a stream without them, the time is that until its last episode ended.
     """
     setup = {(record.run, record.batch, record.setup_s) for record in records}
     shares: dict[tuple[int, int], float] = {}

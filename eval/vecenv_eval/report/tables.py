@@ -12,9 +12,11 @@ from rich.table import Table
 from rich.text import Text
 
 from vecenv_eval.conditions import describe
-from vecenv_eval.report.summary import Row, Summary
+from vecenv_eval.report.summary import PartRow, Row, Summary
 
 STAND_INS = "Files were missing, and something plain stood in for them"
+PARTS = "Intermediate results of the success check after the last tick, by upstream's names:"
+_PART_COLUMNS = ("task", "result", "held", "share")
 _TEXT = "instruction"
 _COLUMNS = ("task", _TEXT, "solved", "rate", "95 % interval", "steps", "faults", "errors", "not run")
 # The last columns count what went wrong; on the screen they take room only when something did.
@@ -48,7 +50,8 @@ def markdown(summary: Summary) -> str:
     title = f"# {summary.suite}, policy {summary.policy}"
     missing = ["", f"{STAND_INS}:", "", *stand_in_lines(summary)] if summary.stand_ins else []
     ran_under = ["", describe(summary.conditions)] if summary.conditions else []
-    return "\n".join([title, *ran_under, "", *lines, "", closing_line(summary), *missing, *reported, ""])
+    parts = ["", PARTS, "", *_parts_lines(summary)] if summary.parts else []
+    return "\n".join([title, *ran_under, "", *lines, "", closing_line(summary), *parts, *missing, *reported, ""])
 
 
 def closing_line(summary: Summary) -> str:
@@ -72,6 +75,19 @@ def _verdicts(total: Row) -> str:
 def stand_in_lines(summary: Summary) -> list[str]:
     """What stood in for missing files, and in how many episodes; one line each."""
     return [f"- {count} episodes: {note}" for note, count in summary.stand_ins.items()]
+
+
+def part_cells(row: PartRow) -> tuple[str, str, str, str]:
+    """One intermediate result: task, name, in how many episodes it held, and its share, or the mean of a number."""
+    if row.share is None:
+        return str(row.task), row.name, f"{row.episodes}", "-" if row.mean is None else f"mean {row.mean:.4g}"
+    return str(row.task), row.name, f"{row.held}/{row.episodes}", f"{row.share:.1%}"
+
+
+def _parts_lines(summary: Summary) -> list[str]:
+    """The intermediate results as a table."""
+    cells = [_PART_COLUMNS, ["---"] * len(_PART_COLUMNS), *map(part_cells, summary.parts)]
+    return [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in cells]
 
 
 def _extras_lines(summary: Summary) -> list[str]:

@@ -31,16 +31,18 @@ class Record:
         num_steps: control ticks executed.
         reward: sum of rewards, None when it was not finite.
         fault: why the slot was quarantined, "" when it was healthy. Such an episode counts as a failure.
-        error: why the episode has no verdict (an exception in its batch), "" when it has one.
+        error: why the episode has no verdict (an exception while it ran), "" when it has one.
         sanitized: calls of the policy whose actions held non-finite values or values out of range.
         sanitized_first: the control tick of the first of them, None when there was none.
         run: which run on this folder, 0 for the first, one more at each resume.
         batch: which stream of episodes of that run.
         setup_s: seconds it took to place the episode (building or re-placing the environment, and reset).
         wall_s: seconds from then until this episode ended, the policy's included.
-        policy_s, physics_s, images_s: its share of what its batch spent in the policy, in physics and in rendering.
+        policy_s, physics_s, images_s: its share of what its stream spent in the policy, in physics and in rendering.
         extras: what the policy reports about the episode, numbers and texts by name.
         stand_ins: a sentence for each file that was missing and what was used instead.
+        parts: SIMPLER's intermediate results of the success check after the last tick, by upstream's names: true or
+            false, or a number. LIBERO has none.
     """
 
     suite: str
@@ -65,6 +67,7 @@ class Record:
     stand_ins: tuple[str, ...] = ()
     success_first: bool = False
     success_final: bool = False
+    parts: Mapping[str, bool | float] = field(default_factory=dict)
 
     @property
     def verdict(self) -> dict[str, Any]:

@@ -46,6 +46,7 @@ COLUMNS = {
     "images_s": "REAL NOT NULL",
     "extras": "JSON NOT NULL",
     "stand_ins": "JSON NOT NULL",
+    "parts": "JSON NOT NULL",
 }
 KEY = ("suite", "task", "episode")
 _NAMES = ", ".join(COLUMNS)

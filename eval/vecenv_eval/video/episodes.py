@@ -2,12 +2,13 @@
 
 A results folder and what to keep come in; ``videos/{suite}_{task}_{episode}.mp4`` go out. Frames are encoded as they
 come, so memory does not grow with the length of an episode: an encoder takes about 5 MB for two images of 256 x 256.
-A runner uses :class:`EpisodeVideos` like any watcher (``vecenv_eval.watch``)::
+:class:`EpisodeVideos` is an episode recorder (``vecenv_eval.watch``)::
 
     videos = EpisodeVideos(folder, keep="failures")
+    videos.begin(env, {slot: episode})
     with watching(env, [videos]):
         ...  # whenever the episode in a slot ends, and before the slot is placed anew:
-        videos.finish(slot, record)
+        videos.finish(env, {slot: record})
     videos.close()
 """
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def video_path(folder: Path, episode: Episode) -> Path:
 
 
 class EpisodeVideos:
-    """A watcher that writes one mp4 an episode.
+    """An episode recorder that writes one mp4 an episode.
 
     Args:
         folder: the results folder.
@@ -54,6 +55,12 @@ class EpisodeVideos:
     def __init__(self, folder: Path, keep: str = FAILURES, cameras: Sequence[str] = CAMERAS) -> None:
         self._folder, self._keep, self._cameras = folder, keep, tuple(cameras)
         self._open: dict[int, VideoWriter] = {}
+
+    def begin(self, env: Observable, episodes: Mapping[int, Episode]) -> None:
+        """Drop what there is of these slots: a video of an episode that never finished."""
+        for slot in episodes:
+            if slot in self._open:
+                self._drop(slot)
 
     def observe(self, env: Observable, slots: Sequence[int], actions: np.ndarray | None = None) -> None:
         """Add a frame for each slot.
@@ -70,25 +77,26 @@ class EpisodeVideos:
                 self._open[slot] = VideoWriter(self._partial / f"{slot}.mp4", env.control_hz, crf=_CRF)
             self._open[slot].add(side_by_side([of_camera[slot] for of_camera in images.values()]))
 
-    def finish(self, slot: int, record: Record, env: Observable | None = None) -> None:
-        """Keep the video of the episode that ended in a slot, or drop it.
+    def finish(self, env: Observable, records: Mapping[int, Record]) -> None:
+        """Keep the videos of the episodes that ended, or drop them; the last frame of each shows its end.
 
         Args:
-            slot: where it ran; without any observation there, nothing happens.
-            record: how it ended.
-            env: the environment while the slot still shows the end, which becomes the last frame.
+            env: the environment, in which the slots still show the end.
+            records: how the episode in each slot ended; a slot without any observation is passed over.
         """
-        if slot not in self._open:
-            return
-        kept = self._keep == ALL or not record.success or bool(record.error)
-        if kept and env is not None:
-            self.observe(env, [slot])
-        video = self._open.pop(slot)
-        video.close()
-        if kept:
+        ended = {slot: record for slot, record in records.items() if slot in self._open}
+        kept = {
+            slot: record
+            for slot, record in ended.items()
+            if self._keep == ALL or not record.success or bool(record.error)
+        }
+        self.observe(env, list(kept))
+        for slot, record in kept.items():
+            video = self._open.pop(slot)
+            video.close()
             video.path.replace(video_path(self._folder, record.key))
-        else:
-            video.path.unlink()
+        for slot in ended.keys() - kept.keys():
+            self._drop(slot)
 
     def close(self) -> None:
         """Drop the videos of episodes that have not finished."""
@@ -96,6 +104,11 @@ class EpisodeVideos:
             video.close()
         self._open.clear()
         shutil.rmtree(self._partial, ignore_errors=True)
+
+    def _drop(self, slot: int) -> None:
+        video = self._open.pop(slot)
+        video.close()
+        video.path.unlink(missing_ok=True)
 
     @property
     def _partial(self) -> Path:

@@ -205,6 +205,21 @@ def test_seeds_that_upstream_does_not_take_are_refused(seed: Any) -> None:
         ONCE.at(seed, 0, 0)
 
 
+@pytest.mark.parametrize(("protocol", "seed"), [("seed", 0), ("openpi", 7)])
+def test_without_a_seed_fixtures_stand_as_the_protocols_seed_has_them(protocol: str, seed: int) -> None:
+    def poses_of(**options: Any) -> list[np.ndarray]:
+        common = {"fixtures": "upstream", "start": "raw", "settle_steps": 0, "protocol": protocol, "num_threads": 1}
+        with vecenv.make("libero_goal", task=0, episodes=[0, 3], **common, **options) as env:
+            env.reset()
+            return [snapshot.poses[name] for snapshot in env.observe_objects().snapshot if snapshot for name in names]
+
+    names = placements(*scene_of("libero_goal", 0))
+    assert LiberoConfig(protocol=protocol, seed=None).rules("libero_goal").seed == seed
+    without, same, other = poses_of(seed=None), poses_of(seed=seed), poses_of(seed=seed + 1)
+    np.testing.assert_array_equal(without, same)
+    assert not np.array_equal(without, other)
+
+
 @pytest.mark.parametrize("seed", [-1, MAX_SEED + 1, True, 1.5, "7"])
 def test_a_configuration_with_such_a_seed_is_refused_before_anything_is_built(seed: Any) -> None:
     with pytest.raises(ProtocolError, match=f"integers from 0 to {MAX_SEED}"):

@@ -24,7 +24,7 @@ from vecenv.libero.render.drawing import ROBOT, Pose, Stage, camera_view
 from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.scene.bddl import Problem, SceneKey
-from vecenv.observations import CameraView, Rendered
+from vecenv.observations import CameraView, Rendered, choose_cameras
 
 if TYPE_CHECKING:
     from vecenv.libero.render.raytrace import RayRenderer
@@ -63,13 +63,14 @@ class CameraRig:
     Args:
         config: how to render.
         num_envs: slots, B.
+        chosen: the cameras that captures show; None for all.
 
     Attributes:
         seconds: time spent rendering so far.
     """
 
-    def __init__(self, config: RenderConfig, num_envs: int) -> None:
-        self.config = config
+    def __init__(self, config: RenderConfig, num_envs: int, chosen: Sequence[str] | None = None) -> None:
+        self.config, self._chosen = config, chosen
         self.options: list[VisualOptions] = [VisualOptions()] * num_envs
         self._renderer: GlRenderer | None = None
         self._rays: RayRenderer | None = None
@@ -85,6 +86,16 @@ class CameraRig:
             yield
         finally:
             self.seconds += time.perf_counter() - started
+
+    def names(self, models: Sequence[mujoco.MjModel]) -> tuple[str, ...]:
+        """The cameras that captures of scenes with these models show.
+
+        Raises:
+            UnknownCamera: one that was chosen is not in all of them.
+            RenderError: a user camera has the name of a scene's.
+        """
+        there = _camera_names(models, self.config.cameras)
+        return there if self._chosen is None else choose_cameras(self._chosen, there)
 
     def capture(self, groups: Sequence[Group], problems: Sequence[Problem], slots: np.ndarray) -> Capture:
         """Capture the poses of now; ``problems`` has one for each group, ``slots`` the indices of those to draw."""
@@ -170,7 +181,7 @@ class Capture:
                 instances[slot] = ("", ROBOT, *group.scene.entities)
         self._shots = [shots[slot] for slot in range(count)]
         self.instances = tuple(instances)
-        names = _camera_names(self._models, rig.config.cameras)
+        names = rig.names(self._models)
         self.images = Rendered(names, self._rendering(Wanted(), lambda frames: frames.rgb))
         self.depths = Rendered(names, self._rendering(Wanted(rgb=False, depth=True), lambda frames: frames.depth))
         self.segmentations = Rendered(

@@ -64,6 +64,16 @@ class Arena:
     cameras: tuple[Camera, ...] = field(default_factory=tuple)
 
 
+# Cameras in the MJCF of every workspace, and those of the robot.
+_IN_EVERY_ARENA = ("frontview", "birdview", "agentview", "sideview")
+_OF_ROBOT = ("robot0_robotview", "robot0_eye_in_hand")
+
+
+def camera_names(arena: Arena) -> tuple[str, ...]:
+    """Names of the cameras that scenes in a workspace have, in their order in the compiled model."""
+    return tuple(dict.fromkeys((*_IN_EVERY_ARENA, *(camera.name for camera in arena.cameras), *_OF_ROBOT)))
+
+
 _DOWN: Quat = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
 _LOW: Quat = (0.6182166934013367, 0.3432307541370392, 0.3432314395904541, 0.6182177066802979)
 _FRONT: Quat = (0.56, 0.43, 0.43, 0.56)
