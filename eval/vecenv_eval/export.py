@@ -1,9 +1,9 @@
 """The rows of results folders as one table in a file: CSV, Parquet, JSON lines or SQLite.
 
-A results folder comes in, or a folder of them (a campaign's); a file goes out, a row an episode, ordered by suite, seed,
-task and episode. Columns are ``policy``, ``protocol``, ``seed`` (empty for the protocol's) and the fields of ``Record``,
-with their types; ``extras`` and ``stand_ins``, which have no fixed form, are JSON text except in JSON lines. CSV and
-Parquet need pyarrow, which is in the extra ``datasets``.
+A results folder comes in, or a folder of them (a campaign's); a file goes out, a row an episode, ordered by suite,
+seed, task and episode. Columns are ``policy``, ``protocol``, ``seed`` (empty for the protocol's) and the fields of
+``Record``, with their types; ``extras`` and ``stand_ins``, which have no fixed form, are JSON text except in JSON
+lines. CSV and Parquet need pyarrow, which is in the extra ``datasets``.
 """
 
 from __future__ import annotations

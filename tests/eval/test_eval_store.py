@@ -8,6 +8,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from datetime import UTC, datetime
@@ -145,12 +146,12 @@ os.kill(os.getpid(), signal.SIGKILL)
         assert len(ResultStore.open(folder).records()) == 4
 
 
-def test_a_closed_database_is_one_file_and_can_be_read_where_nothing_can_be_written(tmp_path: Path) -> None:
+def test_a_closed_database_is_one_file_that_reading_leaves_alone(tmp_path: Path) -> None:
     store = create(tmp_path / "run", "sqlite")
     store.append([record()])
     store.close()
+    assert len(ResultStore.open(store.folder).records()) == 1
     assert {path.name for path in store.folder.iterdir()} == {"config.json", "episodes.sqlite"}
-    assert len(store.records()) == 1
     store.append([record(0, 1)])  # it opens again
     assert len(store.records()) == 2
 
@@ -265,6 +266,21 @@ def test_the_write_ahead_log_is_on_where_it_works_and_off_elsewhere(
     moved.append([record(0, 1)])
     with closing(sqlite3.connect(moved.rows.path)) as database:
         assert database.execute("PRAGMA journal_mode").fetchall() == [("delete",)]
+
+
+def test_a_reader_keeps_neither_the_log_nor_the_run_from_going_on(tmp_path: Path) -> None:
+    store = create(tmp_path / "run", "sqlite")
+    store.append([record()])
+    store.close()
+    with closing(sqlite3.connect(store.rows.path, check_same_thread=False)) as reader:
+        rows = reader.execute("SELECT * FROM episodes")  # a lock until all rows are fetched
+        threading.Timer(0.3, rows.fetchall).start()
+        store.append([record(0, 1)])
+        again = reader.execute("SELECT * FROM episodes")
+        store.append([record(0, 2)])
+        store.close()
+        assert len(again.fetchall()) == 2
+    assert len(ResultStore.open(store.folder).records()) == 3
 
 
 def test_one_process_writes_at_a_time(store: ResultStore) -> None:
@@ -386,9 +402,9 @@ def test_only_an_empty_folder_can_be_discarded(store: ResultStore) -> None:
 
 
 def test_what_a_policy_reports_is_kept_with_the_episode(store: ResultStore) -> None:
-    said = {"subtasks": 3, "cost": float("inf"), "cause": "dropped it"}
+    said = {"subtasks": 3, "cost": float("inf"), "cause": "dropped it", "each": [1.0, float("nan")]}
     store.append([record(extras=said)])
-    assert store.records()[Episode("s", 0, 0)].extras == {**said, "cost": None}
+    assert store.records()[Episode("s", 0, 0)].extras == {**said, "cost": None, "each": [1.0, None]}
     older = (store.folder / "episodes.jsonl").read_text().replace('"extras"', '"unknown"')
     (store.folder / "episodes.jsonl").write_text(older)
     assert store.records()[Episode("s", 0, 0)].extras == {}

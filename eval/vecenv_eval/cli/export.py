@@ -23,13 +23,9 @@ class Format(StrEnum):
 
 
 def export_command(
-    folder: Path = typer.Argument(
-        ..., help="Results folder of `vecenv eval`, or a folder of them, such as a campaign's."
-    ),
+    folder: Path = typer.Argument(..., help="Results folder of `vecenv eval`, or a campaign's."),
     format: Format = typer.Option(..., help="What to write."),
-    out: Path | None = typer.Option(
-        None, help="File to write; it must not exist.", show_default="FOLDER/export.FORMAT"
-    ),
+    out: Path | None = typer.Option(None, help="File to make.", show_default="FOLDER/export.FORMAT"),
 ) -> None:
     """Export every episode as one table: a row an episode, with suite and seed."""
     from vecenv.errors import MissingDependency, VecenvError

@@ -1,8 +1,8 @@
 """``vecenv merge``: the parts of an evaluation, run with ``vecenv eval --shard i/n``, as one results folder.
 
 Results folders come in; one comes out, with the table and the files that a single run would have left. The exit
-status is 0 when every episode has a verdict, 1 when some have none (yet) or a package is missing, and 2 when the folders
-do not belong together.
+status is 0 when every episode has a verdict, 1 when some have none (yet) or a package is missing, and 2 when the
+folders do not belong together.
 """
 
 from __future__ import annotations

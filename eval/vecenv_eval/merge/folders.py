@@ -123,17 +123,14 @@ def _merge_one(
     suite = simulator.suite(config.suite, config.protocol)
     _, episodes = chosen_episodes(config, suite)
     planned = [Episode(suite.name, task, episode) for task, some in episodes.items() for episode in some]
-    joined = _join(every, frozenset(planned))
+    _join(every, frozenset(planned))  # refuses what does not fit before a folder is made
     if (out / CONFIG).is_file():
-        config = replace(config, store=read_source(out).config.store)
+        config = replace(config, store=every[0].config.store)
     store = open_or_begin(config, out)
     with store.writing():
-        merged = read_source(out)  # what the sources are added to, now that nobody else writes
-        new = {
-            key: source
-            for key, (record, source) in joined.items()
-            if source.folder != out and record.replaces(merged.records.get(key)) and not _same(merged, key, record)
-        }
+        merged = read_source(out)  # as it is now that nobody else writes
+        joined = _join([merged, *sources], frozenset(planned))
+        new = {key: source for key, (_, source) in joined.items() if source is not merged}
         copy_artifacts(store, new)
         runs, numbers = _join_runs(merged, sources)
         content = {**merged.content, **_from_any(every), "runs": runs}
@@ -141,15 +138,9 @@ def _merge_one(
         if conditions is not None:
             content["conditions"] = conditions | stored_as(config, store.rows.describe())
         store.write_config(content)
-        store.append(_renumbered(joined[key][0], new[key], numbers) for key in planned if key in new)
+        store.append(_renumbered(*joined[key], numbers) for key in planned if key in new)
         store.close()
         return write_results(store, suite, planned, content.get("policy_name") or config.policy_name)
-
-
-def _same(merged: Source, key: Episode, record: Record) -> bool:
-    """Whether the merged folder has this verdict, or this error, already."""
-    there = merged.records.get(key)
-    return there is not None and there.verdict == record.verdict
 
 
 def _join(sources: Sequence[Source], planned: Collection[Episode]) -> dict[Episode, tuple[Record, Source]]:

@@ -106,7 +106,8 @@ def _check_versions(sources: Sequence[Source]) -> None:
     for source in sources:
         for run in source.runs:
             listed = run.get("versions")
-            for name in DECISIVE if isinstance(listed, dict) else ():
+            listed = listed if isinstance(listed, dict) else {}
+            for name in DECISIVE:
                 if (version := listed.get(name)) is None:
                     continue
                 other, where = seen.setdefault(name, (version, source.folder))

@@ -83,7 +83,7 @@ class Record:
 
 def to_plain(record: Record) -> dict[str, Any]:
     """A record as JSON has it: no NaN or infinity, which become null."""
-    return _finite({**asdict(record), "stand_ins": list(record.stand_ins)})
+    return _finite(asdict(record))
 
 
 def from_plain(values: Mapping[str, Any]) -> Record:
@@ -99,6 +99,9 @@ def from_plain(values: Mapping[str, Any]) -> Record:
     return Record(**{**values, **both, "stand_ins": tuple(values.get("stand_ins", ()))})
 
 
-def _finite(row: dict[str, Any]) -> dict[str, Any]:
-    finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
-    return {k: _finite(v) if isinstance(v, dict) else v for k, v in finite.items()}
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {name: _finite(each) for name, each in value.items()}
+    return [_finite(each) for each in value] if isinstance(value, list | tuple) else value

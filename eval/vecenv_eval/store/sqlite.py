@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -131,11 +132,12 @@ class SqliteRows:
         )
 
     def close(self) -> None:
-        """Close the database; with the last connection its log becomes part of it."""
+        """Close the database, whose log becomes part of it, so that it is one file until somebody writes again."""
         connection, self._connection = self._connection, None
-        if connection is not None:
-            with self._errors("closed"):
-                connection.close()
+        if connection is None:
+            return
+        with self._errors("closed"), closing(connection), suppress(sqlite3.OperationalError):
+            connection.execute("PRAGMA journal_mode = delete")  # not while somebody reads: then the log stays
 
     def remove(self) -> None:
         """Delete the database, and its log and journal."""
@@ -148,7 +150,7 @@ class SqliteRows:
         if self._connection is None:
             connection = sqlite3.connect(self.path, timeout=_TIMEOUT_S, check_same_thread=False)
             try:
-                ((self.journal,),) = connection.execute(f"PRAGMA journal_mode = {self.journal}").fetchall()
+                self.journal = _set_journal(connection, self.journal)
                 connection.execute("PRAGMA synchronous = FULL")
                 with connection:
                     connection.execute("BEGIN IMMEDIATE")
@@ -207,6 +209,19 @@ class SqliteRows:
             yield
         except (sqlite3.Error, UnicodeDecodeError) as error:
             raise StoreError(f"{self.path} cannot be {done}: {error}") from None
+
+
+def _set_journal(connection: sqlite3.Connection, mode: str) -> str:
+    """Set the journal mode once nobody reads, for which SQLite itself does not wait; gives the mode in use."""
+    deadline = time.monotonic() + _TIMEOUT_S
+    while True:
+        try:
+            ((found,),) = connection.execute(f"PRAGMA journal_mode = {mode}").fetchall()
+            return found
+        except sqlite3.OperationalError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
 
 
 def sqlite_values(row: Mapping[str, Any]) -> dict[str, Any]:

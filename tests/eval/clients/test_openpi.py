@@ -14,7 +14,8 @@ from vecenv_eval.clients.codecs import numpy_msgpack
 from vecenv_eval.clients.errors import PolicyServerError
 from vecenv_eval.clients.openpi import OpenPiPolicy
 from vecenv_eval.policies import Policy, PolicyError, make_policy
-from vecenv_eval.runner import EvalConfig, Simulator, begin, evaluate
+from vecenv_eval.results import begin
+from vecenv_eval.runner import EvalConfig, Simulator, evaluate
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection
 
