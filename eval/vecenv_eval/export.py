@@ -2,7 +2,7 @@
 
 A results folder comes in, or a folder of them (a campaign's); a file goes out, a row an episode, ordered by suite,
 seed, task and episode. Columns are ``policy``, ``protocol``, ``seed`` (empty for the protocol's) and the fields of
-``Record``, with their types; ``extras``, ``parts`` and ``stand_ins`` have no fixed form and are JSON text except in JSON
+``Record``, with their types; ``extras``, ``parts`` and ``stand_ins`` have no fixed form: JSON text, except in JSON
 lines. CSV and Parquet need pyarrow, which is in the extra ``datasets``.
 """
 
