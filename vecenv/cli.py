@@ -24,13 +24,20 @@ COMMAND_GROUP = "vecenv.commands"
 
 
 def main() -> None:
-    """Entry point of the ``vecenv`` console script."""
-    from vecenv.assets import AssetsMissing
+    """Entry point of the ``vecenv`` console script; what is raised on purpose becomes one line and an exit status."""
+    from vecenv.errors import InvalidInput, NotFound, VecenvError
+    from vecenv.util.extras import EXTRAS, how_to_install
 
     try:
         build_app()()
-    except AssetsMissing as error:
-        typer.echo(f"error: {error}", err=True)
+    except VecenvError as error:
+        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        raise SystemExit(2 if isinstance(error, InvalidInput | NotFound) else 1) from None
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if module not in EXTRAS:
+            raise
+        typer.echo(f"error: {how_to_install(module)}", err=True)
         raise SystemExit(1) from None
 
 

@@ -17,12 +17,11 @@ from typing import Any
 
 from vecenv.util.tables import Column, FittedTable
 from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.results import EvalResult, Progress, begin, resume
+from vecenv_eval.results import CAMPAIGN, EvalResult, Progress, begin, resume
 from vecenv_eval.runner import Evaluation, check
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import CONFIG, REPORT, SUMMARY, StoreError
 
-CAMPAIGN = "campaign.json"
 _OVER_SEEDS = "Success: mean and sample standard deviation over seeds."
 
 
@@ -114,6 +113,10 @@ class Campaign:
         folder: the results folder of the whole.
         simulator: where environments come from, ``vecenv`` when not given.
 
+    Attributes:
+        legs: the runs.
+        num_episodes: how many episodes each run has.
+
     Raises:
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
     """
@@ -121,8 +124,10 @@ class Campaign:
     def __init__(self, config: EvalConfig, folder: Path, simulator: Simulator | None = None) -> None:
         self.config, self.folder, self._simulator = config, folder, simulator
         self.legs = legs(config, folder)
+        self.num_episodes = []
         for leg in self.legs:
-            check(leg.config, simulator or vecenv_simulator())
+            _, _, episodes = check(leg.config, simulator or vecenv_simulator())
+            self.num_episodes.append(sum(map(len, episodes.values())))
 
     @classmethod
     def open(cls, folder: Path, simulator: Simulator | None = None) -> Campaign:

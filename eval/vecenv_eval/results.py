@@ -5,14 +5,17 @@ Records come in as episodes end; :class:`Progress` goes to whoever watches, :cla
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.report import Summary
 from vecenv_eval.store import CONFIG, Record, ResultStore, StoreError
+
+# In the folder of a campaign (``vecenv_eval.campaign``), whose runs have folders below it.
+CAMPAIGN = "campaign.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +28,10 @@ class Progress:
         successes, faults, errors: among the episodes so far.
         steps: control ticks executed in this run, summed over slots.
         seconds: seconds this run has spent running episodes.
-        batch, num_batches: which batch is running.
-        setting_up: the batch is being placed.
+        batch, num_batches: which stream of episodes is running, of how many.
+        setting_up: the environment of the stream is being built, or its episodes are being placed.
+        ended: the episodes that have ended since the last call, those that ended in an error included.
+        conditions: what episodes run under (``vecenv_eval.conditions``); empty until there is an environment.
     """
 
     total: int
@@ -39,6 +44,8 @@ class Progress:
     batch: int
     num_batches: int
     setting_up: bool
+    ended: tuple[Record, ...] = ()
+    conditions: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +57,7 @@ class EvalResult:
         records: the record of each episode that ran.
         folder: the results folder.
         interrupted: it was stopped from the keyboard.
-        causes: what the failed batches of this run raised, without repetition.
+        causes: what the failed streams of this run raised, without repetition.
     """
 
     summary: Summary
@@ -102,3 +109,9 @@ def count(records: Iterable[Record]) -> dict[str, int]:
         "faults": sum(bool(record.fault) for record in records),
         "errors": errors,
     }
+
+
+def campaign_of(folder: Path) -> Path | None:
+    """The folder of the campaign that a results folder belongs to (``DIR/SUITE`` or ``DIR/seed-0/SUITE``), if any."""
+    above = folder.resolve().parents[:2]
+    return next((place for place in above if (place / CAMPAIGN).is_file()), None)

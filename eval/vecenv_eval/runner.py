@@ -7,14 +7,17 @@ before anything is built, plans the batches, runs them (``vecenv_eval.loop``) an
 
 from __future__ import annotations
 
+import functools
 import inspect
+import logging
 from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vecenv import family, protocols
 from vecenv.errors import VecenvError
 from vecenv.placement import episode_indices
-from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
+from vecenv.util.extras import how_to_install, is_installed
+from vecenv_eval.config import SCRIPTED, VIDEO_CHOICES, ConfigError, EvalConfig, default_policy
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
 from vecenv_eval.loop import EpisodeLoop
@@ -24,6 +27,10 @@ from vecenv_eval.report import markdown, summarise
 from vecenv_eval.results import EvalResult, Progress, begin
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import RESULTS, ResultStore, default_folder
+from vecenv_eval.trackers import Tracking
+from vecenv_eval.trackers import require as require_trackers
+
+_log = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -93,6 +100,18 @@ class Evaluation:
         Raises:
             ConfigError: the environment refuses a setting; a results folder without episodes is removed.
         """
+        _warn_without_gpu(self.config.backend)
+        with Tracking(self.config, store) as tracking:
+
+            def report(progress: Progress) -> None:
+                on_progress(progress)
+                tracking.progress(progress)
+
+            result = self._run(store, report)
+            tracking.end(result)
+        return result
+
+    def _run(self, store: ResultStore, on_progress: Callable[[Progress], None]) -> EvalResult:
         content = store.config()
         store.write_config({**content, "runs": [*content["runs"], run_conditions()]})
         loop = EpisodeLoop(
@@ -150,6 +169,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     tasks, episodes = _chosen_episodes(config, suite)
     _check_make(simulator, config)
     _check_record(config)
+    _check_packages(config)
     _check_policy(config)
     check_policy(config.policy_name, **config.policy_args)
     return suite, tasks, episodes
@@ -195,3 +215,28 @@ def _check_record(config: EvalConfig) -> None:
     """Recordings are LIBERO's HDF5 files: they hold MuJoCo states and begin from LIBERO's init states."""
     if config.records and family(config.suite) == protocols.SIMPLER:
         raise ConfigError(f"{config.suite} cannot be recorded: recordings are in LIBERO's layout, for LIBERO's suites")
+
+
+def _check_packages(config: EvalConfig) -> None:
+    """Refuse what needs a package that is not installed, before the first episode would fail for want of it."""
+    require_trackers(config.trackers)
+    needs = {
+        "--record": ("h5py",) if config.records else (),
+        f"--video {config.video}": ("av",) if config.video != VIDEO_CHOICES[0] else (),
+        "--record-lerobot": ("pyarrow", "av") if config.record_lerobot else (),
+    }
+    for option, modules in needs.items():
+        for module in modules:
+            if not is_installed(module):
+                raise ConfigError(f"{option}: {how_to_install(module)}")
+
+
+@functools.cache
+def _warn_without_gpu(backend: str) -> None:
+    """Say once that MuJoCo Warp runs on the CPU, where there is no other device."""
+    if backend != "warp":
+        return
+    import jax
+
+    if jax.default_backend() not in ("gpu", "cuda"):
+        _log.warning("--backend warp: no CUDA device: this runs on the CPU and is slow (--backend native is fast there)")
