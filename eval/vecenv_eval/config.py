@@ -154,11 +154,11 @@ class EvalConfig:
     )
     track: str = field(
         default=NO_TRACKER,
-        metadata=_about(
-            "Experiment trackers to log to: wandb, trackio, tensorboard, or several: a,b.", resumable=True
-        ),
+        metadata=_about("Experiment trackers to log to: wandb, trackio, tensorboard, or several: a,b.", resumable=True),
     )
-    fail_fast: bool = field(default=False, metadata=_about("Stop at the first stream of episodes that raises.", resumable=True))
+    fail_fast: bool = field(
+        default=False, metadata=_about("Stop at the first stream of episodes that raises.", resumable=True)
+    )
 
     def __post_init__(self) -> None:
         if self.video not in VIDEO_CHOICES:

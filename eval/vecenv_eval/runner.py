@@ -21,7 +21,7 @@ from vecenv_eval.config import SCRIPTED, VIDEO_CHOICES, ConfigError, EvalConfig,
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
 from vecenv_eval.loop import EpisodeLoop
-from vecenv_eval.policies import Closing, Refillable, check_policy, make_policy
+from vecenv_eval.policies import Closing, Refillable, check_policy, make_policy, raised
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.report import markdown, summarise
 from vecenv_eval.results import EvalResult, Progress, begin
@@ -130,9 +130,17 @@ class Evaluation:
             store.discard()
             raise
         finally:
-            if isinstance(self.policy, Closing):
-                self.policy.close()
+            self._close_policy()
         return self._summarise(store, interrupted, tuple(loop.causes))
+
+    def _close_policy(self) -> None:
+        """Let the policy release what it holds; what it raises then costs no result."""
+        if not isinstance(self.policy, Closing):
+            return
+        try:
+            self.policy.close()
+        except Exception as error:
+            _log.warning("policy %r could not be closed: %s", self.policy.name, raised(error))
 
     def _again(self, episodes: Collection[Episode]) -> list[Stream]:
         """Streams of these episodes alone."""
@@ -239,4 +247,6 @@ def _warn_without_gpu(backend: str) -> None:
     import jax
 
     if jax.default_backend() not in ("gpu", "cuda"):
-        _log.warning("--backend warp: no CUDA device: this runs on the CPU and is slow (--backend native is fast there)")
+        _log.warning(
+            "--backend warp: no CUDA device: this runs on the CPU and is slow (--backend native is fast there)"
+        )

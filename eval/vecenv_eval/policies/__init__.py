@@ -120,7 +120,8 @@ def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
         **arguments: constructor arguments.
 
     Raises:
-        PolicyError: the name is unknown, its module does not import, it does not take the arguments, or making it raised.
+        PolicyError: the name is unknown, its module does not import, it does not take the arguments, or it raises an
+            exception.
     """
     factory = _bound(name, seed, arguments)
     try:
@@ -173,6 +174,8 @@ def raised(error: BaseException) -> str:
     """An exception in a sentence: its type, its message, and the file and line that raised it."""
     text = " ".join(f"{type(error).__name__}: {error}".rstrip(": ").split())
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if not frame.filename.startswith("<frozen") and frame.filename != importlib.__file__]
+    own = [
+        frame for frame in frames if not frame.filename.startswith("<frozen") and frame.filename != importlib.__file__
+    ]
     # Of an error in this file, such as a module that is not there, the line says nothing to the user.
     return f"{text} ({own[-1].filename}:{own[-1].lineno})" if own and own[-1].filename != __file__ else text

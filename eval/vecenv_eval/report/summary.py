@@ -70,6 +70,7 @@ class Summary:
             often each text was reported.
         stand_ins: how many episodes ran with what in place of a missing file.
         conditions: what the episodes ran under, see ``vecenv_eval.conditions``; empty when no environment was made.
+        sanitized: episodes with actions that were not finite or out of range, and were changed.
     """
 
     suite: str
@@ -83,6 +84,7 @@ class Summary:
     extras: Mapping[str, float | dict[str, int]] = field(default_factory=dict)
     stand_ins: Mapping[str, int] = field(default_factory=dict)
     conditions: Mapping[str, Any] = field(default_factory=dict)
+    sanitized: int = 0
 
     @property
     def complete(self) -> bool:
@@ -145,6 +147,7 @@ def summarise(
         extras=_extras(found),
         stand_ins=dict(Counter(note for record in found for note in record.stand_ins).most_common()),
         conditions=conditions or {},
+        sanitized=sum(bool(record.sanitized) for record in found),
     )
 
 

@@ -43,7 +43,8 @@ def markdown(summary: Summary) -> str:
     title = f"# {summary.suite}, policy {summary.policy}"
     missing = ["", f"{STAND_INS}:", "", *stand_in_lines(summary)] if summary.stand_ins else []
     ran_under = ["", describe(summary.conditions)] if summary.conditions else []
-    return "\n".join([title, *ran_under, "", *lines, "", closing_line(summary), *missing, *reported, ""])
+    sanitized = ["", sanitized_line(summary)] if summary.sanitized else []
+    return "\n".join([title, *ran_under, "", *lines, "", closing_line(summary), *sanitized, *missing, *reported, ""])
 
 
 def closing_line(summary: Summary) -> str:
@@ -62,6 +63,13 @@ def _verdicts(total: Row) -> str:
     if total.first == total.final:
         return ""
     return f"The goal held at some tick in {total.first} and at the last tick in {total.final} of them. "
+
+
+def sanitized_line(summary: Summary) -> str:
+    """How many episodes had actions that were not executed as they were, in a sentence; "" for none."""
+    if not summary.sanitized:
+        return ""
+    return f"Sanitised actions in {summary.sanitized} episodes: not finite (set to 0) or out of range (clipped)."
 
 
 def stand_in_lines(summary: Summary) -> list[str]:

@@ -116,9 +116,7 @@ class Tracking:
         clock: seconds, monotonic.
     """
 
-    def __init__(
-        self, config: EvalConfig, store: ResultStore, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, config: EvalConfig, store: ResultStore, clock: Callable[[], float] = time.monotonic) -> None:
         self._config, self._store, self._clock = config, store, clock
         self._pace = Pace(clock)
         self._trackers: dict[str, Tracker] = {}
@@ -136,7 +134,7 @@ class Tracking:
 
     def progress(self, now: Progress) -> None:
         """Take in a report; numbers are logged when episodes have ended, but not more often than ``INTERVAL_S``."""
-        if not self._config.trackers or now.setting_up and not now.ended:
+        if not self._config.trackers or (now.setting_up and not now.ended):
             return
         self._start(now.conditions)
         rates = self._pace.update(now)

@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-import wandb
+import wandb  # pyright: ignore[reportMissingImports]
 
 from vecenv_eval.trackers import PROJECT, TrackedRun
 
@@ -18,7 +18,7 @@ _STEP = "ended"
 
 
 class WandbTracker:
-    """A run whose steps are the episodes that have ended; wandb's own step count would refuse to go back on a resume."""
+    """A run whose axis is the episodes that have ended; wandb's own steps could not go back on a resume."""
 
     def start(self, run: TrackedRun) -> None:
         """Begin the run, or continue it; what is printed is not captured."""
