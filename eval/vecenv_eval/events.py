@@ -22,11 +22,6 @@ class _Event(BaseModel):
         return self.model_dump_json()
 
 
-class _OfRun(_Event):
-    suite: str
-    seed: int | None
-
-
 class Run(_Event):
     """One run: a suite with a seed (null: the protocol's), its results folder, and how many episodes it has."""
 
@@ -47,14 +42,16 @@ class Start(_Event):
     runs: tuple[Run, ...]
 
 
-class Conditions(_OfRun):
+class Conditions(_Event):
     """What the episodes of a run are about to run under, as in ``config.json``."""
 
     event: Literal["conditions"] = "conditions"
+    suite: str
+    seed: int | None
     conditions: Mapping[str, Any]
 
 
-class ProgressEvent(_OfRun):
+class ProgressEvent(_Event):
     """Where a run stands; at most once a second, and once at its end.
 
     ``done`` of ``total`` episodes have a verdict (those of earlier runs on the folder included), ``successes`` were
@@ -62,6 +59,8 @@ class ProgressEvent(_OfRun):
     """
 
     event: Literal["progress"] = "progress"
+    suite: str
+    seed: int | None
     total: int
     done: int
     successes: int
@@ -76,10 +75,12 @@ class ProgressEvent(_OfRun):
     setting_up: bool
 
 
-class EpisodeEvent(_OfRun):
+class EpisodeEvent(_Event):
     """An episode has ended: its row of ``episodes.jsonl``. After an error it may come again (``--retries``)."""
 
     event: Literal["episode"] = "episode"
+    suite: str
+    seed: int | None
     record: Mapping[str, Any]
 
 
@@ -92,10 +93,12 @@ class ErrorEvent(_Event):
     seed: int | None = None
 
 
-class SummaryEvent(_OfRun):
+class SummaryEvent(_Event):
     """A run has ended: its ``summary.json``. ``complete``: every episode has a verdict."""
 
     event: Literal["summary"] = "summary"
+    suite: str
+    seed: int | None
     folder: str
     complete: bool
     interrupted: bool

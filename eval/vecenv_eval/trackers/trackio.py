@@ -43,4 +43,4 @@ class TrackioTracker:
 
     def close(self, ok: bool) -> None:
         """Wait until everything is written."""
-        self._run.finish()
+        trackio.finish()  # not the run's own method: at the exit of the process it would be finished again
