@@ -276,6 +276,7 @@ def shown(legs: list[Leg], reports: list[tuple[int, Progress]], terminal: bool =
     for index, report in reports:
         screen.progress(legs[index], report)
     screen.end(0, Path("run"))
+    screen.close()
     return console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -331,3 +332,12 @@ def test_an_output_that_goes_away_does_not_end_the_evaluation() -> None:
     screen.progress(leg("libero_goal"), progress(setting_up=True))
     assert screen.gone
     screen.end(0, Path("run"))
+
+
+def test_bars_are_gone_when_the_command_ends_with_an_error() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=80)
+    screen = Screen(console=console)
+    screen.begin(EvalConfig(suite="libero_goal"), Path("run"), [leg("libero_goal")], [20])
+    screen.failed("something", 1)
+    text = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")  # the cursor is shown again

@@ -39,6 +39,11 @@ def main() -> None:
             raise
         typer.echo(f"error: {how_to_install(module)}", err=True)
         raise SystemExit(1) from None
+    except OSError as error:
+        if error.filename is None:  # no file: something that we should know about
+            raise
+        typer.echo(f"error: {error.filename}: {error.strerror}", err=True)
+        raise SystemExit(1) from None
 
 
 def build_app(plugins: Iterable[importlib.metadata.EntryPoint] | None = None) -> typer.Typer:

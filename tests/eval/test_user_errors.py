@@ -266,6 +266,16 @@ def test_warp_without_a_gpu_warns_and_runs(
     runner._warn_without_gpu.cache_clear()
 
 
+def test_a_file_that_cannot_be_written_is_one_sentence_from_any_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(cli, "build_app", lambda: lambda: (tmp_path / "no" / "folder").write_text(""))
+    with pytest.raises(SystemExit) as exit:
+        cli.main()
+    assert exit.value.code == 1
+    assert capsys.readouterr().err == f"error: {tmp_path}/no/folder: No such file or directory\n"
+
+
 # Files.
 
 

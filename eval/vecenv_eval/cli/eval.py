@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -109,7 +109,8 @@ def _display(quiet: bool, as_json: bool) -> Iterator[Display]:
     from vecenv_eval.cli.screen import Screen
 
     if not (quiet or as_json):
-        yield Screen()
+        with closing(Screen()) as screen:
+            yield screen
         return
     with own_stdout() as stream:
         yield JsonLines(stream) if as_json else Screen(stream, quiet=True)

@@ -127,21 +127,23 @@ class Screen:
     @_while_there
     def campaign(self, summary: CampaignSummary) -> None:
         """All runs have ended."""
-        self._close()
+        self.close()
         self._console.print(campaign_table(summary))
 
     @_while_there
     def failed(self, message: str, status: int) -> None:
         """The command ends because something is wrong, which is said on standard error."""
-        self._close()
+        self.close()
 
     @_while_there
     def end(self, status: int, folder: Path) -> None:
         """The command ends."""
-        self._close()
+        self.close()
         print(folder, file=self._console.file, flush=True)
 
-    def _close(self) -> None:
+    @_while_there
+    def close(self) -> None:
+        """Stop the bars, which leaves the terminal as it was; closing twice is harmless."""
         if self._view is not None:
             self._view.close()
 
