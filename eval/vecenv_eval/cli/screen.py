@@ -107,22 +107,9 @@ class Screen:
         """A run has ended: print its table, and what went wrong."""
         if self._view is not None and leg is self._legs[-1]:
             self._view.close()
-        show, summary = self._console.print, result.summary
         if len(self._legs) > 1:
-            show(_name(leg), style="bold", markup=False, highlight=False)
-        show(table(summary))
-        show(closing_line(summary), highlight=False, soft_wrap=True)
-        for line in filter(None, [sanitized_line(summary)]):
-            show(line, style="yellow", markup=False, highlight=False, soft_wrap=True)
-        if summary.stand_ins:
-            show(f"{STAND_INS}:", style="yellow")
-        for line in stand_in_lines(summary):
-            show(line, markup=False, highlight=False, soft_wrap=True)
-        for cause in result.causes:
-            show(f"error in a stream of episodes: {cause}", style="red", markup=False, highlight=False, soft_wrap=True)
-        if not result.ok:
-            again = f"Episodes lack a verdict; to run them: vecenv eval --resume {result.folder}"
-            show(again, markup=False, highlight=False, soft_wrap=True)
+            self._console.print(_name(leg), style="bold", markup=False, highlight=False)
+        print_result(self._console, result)
 
     @_while_there
     def campaign(self, summary: CampaignSummary) -> None:
@@ -146,6 +133,24 @@ class Screen:
         """Stop the bars, which leaves the terminal as it was; closing twice is harmless."""
         if self._view is not None:
             self._view.close()
+
+
+def print_result(console: Console, result: EvalResult) -> None:
+    """Print how a run ended: its table, what is wrong, and how to go on."""
+    summary = result.summary
+    plain: dict[str, Any] = {"markup": False, "highlight": False, "soft_wrap": True}
+    console.print(table(summary))
+    console.print(closing_line(summary), highlight=False, soft_wrap=True)
+    if summary.sanitized:
+        console.print(sanitized_line(summary), style="yellow", **plain)
+    if summary.stand_ins:
+        console.print(f"{STAND_INS}:", style="yellow")
+    for line in stand_in_lines(summary):
+        console.print(line, **plain)
+    for cause in result.causes:
+        console.print(f"error in a stream of episodes: {cause}", style="red", **plain)
+    if not result.ok:
+        console.print(f"Episodes lack a verdict; to run them: vecenv eval --resume {result.folder}", **plain)
 
 
 class _Live:

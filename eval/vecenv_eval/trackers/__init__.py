@@ -31,7 +31,7 @@ from vecenv_eval.video.episodes import video_path
 _KINDS = {
     "tensorboard": ("vecenv_eval.trackers.tensorboard:TensorBoardTracker", "tensorboardX"),
     "trackio": ("vecenv_eval.trackers.trackio:TrackioTracker", "trackio"),
-    "wandb": ("vecenv_eval.trackers.wandb:WandbTracker", "wandb"),
+    "wandb": ("vecenv_eval.trackers.weights_and_biases:WandbTracker", "wandb"),
 }
 PROJECT = "vecenv"
 # Numbers are logged at most this often, seconds.
