@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import io
+import itertools
 import json
 import os
 import subprocess
@@ -16,8 +17,12 @@ from rich.console import Console
 from support.fakes import SUITE, FakeWorld
 from typer.testing import CliRunner, Result
 from vecenv_eval import runner
-from vecenv_eval.cli.eval import _progress
+from vecenv_eval.campaign import Leg
+from vecenv_eval.cli.screen import Screen
+from vecenv_eval.config import EvalConfig
+from vecenv_eval.pace import Pace
 from vecenv_eval.results import Progress
+from vecenv_eval.store import Record
 
 from vecenv import doctor
 from vecenv.cli import build_app
@@ -168,9 +173,10 @@ def test_eval_ends_in_a_table_and_a_results_folder(world: FakeWorld) -> None:
 
 
 def test_eval_without_a_terminal_prints_progress_as_lines(world: FakeWorld) -> None:
-    lines = [line for line in evaluate("--num-envs", "10").stdout.splitlines() if "episodes, batch" in line]
-    assert lines[0] == "0/20 episodes, batch 1/1: setting up"
-    assert lines[-1].startswith("20/20 episodes, batch 1/1: 10 solved, ")
+    lines = [line for line in evaluate("--num-envs", "10").stdout.splitlines() if "episodes, stream" in line]
+    assert lines[0] == "0/20 episodes, stream 1/1: setting up"
+    assert lines[-1].startswith("20/20 episodes, stream 1/1: 10 solved, ")
+    assert lines[-1].endswith(" steps/s, 50.0% success")
 
 
 def test_quiet_prints_the_folder_only(world: FakeWorld) -> None:
@@ -258,11 +264,81 @@ def test_eval_exits_130_after_ctrl_c(world: FakeWorld) -> None:
     assert evaluate("--out", "here").exit_code == 130
 
 
-def test_on_a_terminal_progress_is_one_bar_over_the_episodes() -> None:
-    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+def leg(suite: str, seed: int | None = None) -> Leg:
+    return Leg(suite=suite, seed=seed, config=EvalConfig(suite=suite), folder=Path("run"))
+
+
+def shown(legs: list[Leg], reports: list[tuple[int, Progress]], terminal: bool = True) -> str:
+    """What the screen shows of reports that come a second apart."""
+    clock = itertools.count().__next__
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=80)
+    screen = Screen(console=console, clock=clock)
+    screen.begin(EvalConfig(suite="libero_goal"), Path("run"), legs, [20] * len(legs))
+    for index, report in reports:
+        screen.progress(legs[index], report)
+    screen.end(0, Path("run"))
+    screen.close()
+    return console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def progress(done: int = 0, errors: int = 0, ended: int = 0, **values: Any) -> Progress:
     counts = {"total": 20, "successes": 3, "faults": 1, "steps": 900, "seconds": 3.0, "batch": 1, "num_batches": 2}
-    with _progress(console) as on_progress:
-        on_progress(Progress(done=8, errors=2, setting_up=False, **counts))
-    text = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
-    assert "batch 2/2: 3 solved, 1 faulted, 2 failed, 300 steps/s" in text
+    record = Record(suite="s", task=0, episode=0, instruction="", success=True, num_steps=1, reward=1.0)
+    return Progress(**{**counts, "setting_up": False, **values}, done=done, errors=errors, ended=(record,) * ended)
+
+
+def test_on_a_terminal_progress_is_one_bar_over_the_episodes() -> None:
+    text = shown([leg("libero_goal")], [(0, progress(setting_up=True)), (0, progress(8, 2, ended=10))])
+    assert "libero_goal" in text
     assert "10/20" in text
+    assert "stream 2/2: 3 solved, 1 faulted, 2 failed" in text
+    assert "300 steps/s" in text
+    assert "37.5% success" in text
+    assert "all" not in text
+
+
+def test_the_time_left_follows_from_the_episodes_that_ended_in_this_run() -> None:
+    # The first report comes at 1 s, the second 2 s later: 10 episodes, of which 5 a second; 5 are left.
+    pace = Pace(iter([1.0, 3.0]).__next__)
+    assert pace.update(progress(5)).seconds_left is None
+    rates = pace.update(progress(15, ended=10))
+    assert (rates.episodes_per_s, rates.seconds_left, rates.success_rate) == (5.0, 1.0, 0.2)
+
+
+def test_several_runs_have_a_bar_for_all_and_one_for_the_present_one() -> None:
+    legs = [leg("libero_goal", 0), leg("libero_goal", 1), leg("simpler/google_robot", 1)]
+    text = shown(legs, [(0, progress(20, ended=20)), (1, progress(8, 2, ended=10))])
+    assert "all 3 runs" in text
+    assert "30/60" in text
+    assert "libero_goal, seed 1 (2/3)" in text
+    assert "10/20" in text
+    lines = shown(legs, [(0, progress(20, ended=20)), (1, progress(8, 2, ended=10))], terminal=False).splitlines()
+    assert lines[0].startswith("libero_goal, seed 0: 20/20 episodes, stream 2/2: 3 solved")
+    assert lines[1].startswith("libero_goal, seed 1: 10/20 episodes")
+
+
+def test_a_log_gets_a_line_a_minute_however_slow_the_episodes_are() -> None:
+    reports = [(0, progress(0, errors=1)), *[(0, progress(0, errors=1))] * 200]
+    lines = shown([leg("libero_goal")], reports, terminal=False).splitlines()
+    assert 2 <= len(lines) - 1 <= 8
+
+
+def test_an_output_that_goes_away_does_not_end_the_evaluation() -> None:
+    class Broken(io.StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    screen = Screen(Broken())
+    screen.begin(EvalConfig(suite="libero_goal"), Path("run"), [leg("libero_goal")], [20])
+    screen.progress(leg("libero_goal"), progress(setting_up=True))
+    assert screen.gone
+    screen.end(0, Path("run"))
+
+
+def test_bars_are_gone_when_the_command_ends_with_an_error() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=80)
+    screen = Screen(console=console)
+    screen.begin(EvalConfig(suite="libero_goal"), Path("run"), [leg("libero_goal")], [20])
+    screen.failed("something", 1)
+    text = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+    assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")  # the cursor is shown again

@@ -24,13 +24,25 @@ COMMAND_GROUP = "vecenv.commands"
 
 
 def main() -> None:
-    """Entry point of the ``vecenv`` console script."""
-    from vecenv.assets import AssetsMissing
+    """Entry point of the ``vecenv`` console script; what is raised on purpose becomes one line and an exit status."""
+    from vecenv.errors import InvalidInput, NotFound, VecenvError
+    from vecenv.util.extras import EXTRAS, how_to_install
 
     try:
         build_app()()
-    except AssetsMissing as error:
-        typer.echo(f"error: {error}", err=True)
+    except VecenvError as error:
+        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        raise SystemExit(2 if isinstance(error, InvalidInput | NotFound) else 1) from None
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if module not in EXTRAS:
+            raise
+        typer.echo(f"error: {how_to_install(module)}", err=True)
+        raise SystemExit(1) from None
+    except OSError as error:
+        if error.filename is None:  # no file: something that we should know about
+            raise
+        typer.echo(f"error: {error.filename}: {error.strerror}", err=True)
         raise SystemExit(1) from None
 
 
@@ -156,27 +168,20 @@ def _task_rows(tasks: Iterable[Any], named: bool) -> list[dict[str, Any]]:
 
 def _print_rows(rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table(*rows[0])
-    for row in rows:
-        table.add_row(*map(str, row.values()))
-    Console().print(table)
+    from vecenv.util.tables import from_rows
+
+    Console().print(from_rows(rows))
 
 
 def _print_protocols(chosen: Sequence[Protocol]) -> None:
     """Print a table of the values that protocols fix, then the source and note of each."""
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
 
-    rows, console = [_protocol_row(each) for each in chosen], Console()
-    table = Table(*rows[0], box=box.SIMPLE, pad_edge=False)
-    for row in rows:
-        table.add_row(*map(str, row.values()))
-    # Wide tables break lines on a narrow screen instead of truncating numbers.
-    natural = Console(width=1000).measure(table).maximum
-    Console(width=max(console.width, natural)).print(table)
+    from vecenv.util.tables import from_rows
+
+    console = Console()
+    console.print(from_rows([_protocol_row(each) for each in chosen], keys=2))
     for each in chosen:
         said = "; ".join(map(str, each.sources)) + (f". {each.note}" if each.note else "")
         console.print(f"{each.family} {each.name}: {said}", markup=False, highlight=False, soft_wrap=True)

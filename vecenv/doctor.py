@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING, Any
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Column, Table
 
 from vecenv.util.cores import usable_cores
+from vecenv.util.tables import Column, FittedTable
 
 if TYPE_CHECKING:
     from vecenv.assets import AssetRow
@@ -44,6 +44,7 @@ ALSO_SHOWN = ("jaxlib", "robosuite")
 COLLECTIONS = ("all",)
 LAST = "dev"
 PROBE_SECONDS = 60
+_COLORS = {"missing": "red", "absent": "yellow"}
 
 _GL_PROBE = """
 import ctypes.util, os
@@ -446,17 +447,20 @@ def _memory_gib() -> float:
         return float("nan")
 
 
-def _version_table(rows: tuple[Package, ...]) -> Table:
-    table = Table("package", "version", "wanted", "for", title=f"{DISTRIBUTION} {installed_version(DISTRIBUTION)}")
-    for p in rows:
-        version = p.version if p.ok else f"[red]{p.version or 'missing'}[/]"
-        table.add_row(p.name, version, p.wanted, p.group)
-    return table
+def _version_table(rows: tuple[Package, ...]) -> FittedTable:
+    return FittedTable(
+        columns=[Column("package", key=True), Column("version"), Column("wanted"), Column("for")],
+        rows=[(p.name, p.version or "missing", p.wanted, p.group) for p in rows],
+        title=f"{DISTRIBUTION} {installed_version(DISTRIBUTION)}",
+        styles={number: "red" for number, p in enumerate(rows) if not p.ok},
+    )
 
 
-def _check_table(checks: tuple[Check, ...]) -> Table:
-    table = Table("", "what", Column("found", overflow="fold"), title="This machine")
-    for check in checks:
-        mark = "[green]ok[/]" if check.ok else "[red]missing[/]" if check.core else "[yellow]absent[/]"
-        table.add_row(mark, check.name, escape(check.detail))
-    return table
+def _check_table(checks: tuple[Check, ...]) -> FittedTable:
+    marks = ["ok" if check.ok else "missing" if check.core else "absent" for check in checks]
+    return FittedTable(
+        columns=[Column("", key=True), Column("what", key=True), Column("found", text=True)],
+        rows=[(mark, check.name, check.detail) for mark, check in zip(marks, checks, strict=True)],
+        title="This machine",
+        styles={number: _COLORS[mark] for number, mark in enumerate(marks) if mark in _COLORS},
+    )

@@ -15,14 +15,15 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vecenv.util.tables import Column, FittedTable
 from vecenv_eval.config import ConfigError, EvalConfig
-from vecenv_eval.results import EvalResult, Progress, open_or_begin, refuse_other_settings
+from vecenv_eval.results import CAMPAIGN, EvalResult, Progress, open_or_begin, refuse_other_settings
 from vecenv_eval.runner import Evaluation, check
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import REPORT, SUMMARY, ResultStore, StoreError
 from vecenv_eval.store.files import replace_text
 
-CAMPAIGN = "campaign.json"
+_OVER_SEEDS = "Success: mean and sample standard deviation over seeds."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +115,10 @@ class Campaign:
         simulator: where environments come from, ``vecenv`` when not given.
         checked: check the settings; not needed where nothing is to be run.
 
+    Attributes:
+        legs: the runs.
+        num_episodes: how many episodes each run has.
+
     Raises:
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
     """
@@ -123,8 +128,10 @@ class Campaign:
     ) -> None:
         self.config, self.folder, self._simulator = config, folder, simulator
         self.legs = legs(config, folder)
+        self.num_episodes = []
         for leg in self.legs if checked else ():
-            check(leg.config, simulator or vecenv_simulator())
+            _, _, episodes = check(leg.config, simulator or vecenv_simulator())
+            self.num_episodes.append(sum(map(len, episodes.values())))
 
     @classmethod
     def open(cls, folder: Path, simulator: Simulator | None = None) -> Campaign:
@@ -241,26 +248,36 @@ def _std(values: Sequence[float | None]) -> float | None:
     return statistics.stdev(there) if len(there) > 1 else None
 
 
-def markdown(summary: CampaignSummary) -> str:
-    """A table for ``report.md``: a row a suite, and the average over suites."""
+def table(summary: CampaignSummary) -> FittedTable:
+    """The table for the screen: a row a suite, and the average over suites."""
+    head, rows = _cells(summary)
+    columns = [Column(name, key=name == "suite", justify="left" if name == "suite" else "right") for name in head]
     several = len(summary.seeds) > 1
-    head = [
-        "suite",
-        "success",
-        *([f"seed {seed}" for seed in summary.seeds] if several else []),
-        "episodes",
-        "no verdict",
-    ]
-    lines = [f"# {summary.policy}", "", _line(head), _line(["---"] * len(head))]
-    for row in summary.suites:
-        each = [_percent(rate) for rate in row.rates] if several else []
-        each += ["-"] * (len(summary.seeds) - len(row.rates) if several else 0)
-        lines.append(_line([row.suite, _spread(row.mean, row.std), *each, row.episodes, row.errors + row.missing]))
-    blanks = [""] * (len(head) - 2)
-    lines.append(_line(["average over suites", _spread(summary.average, summary.average_std), *blanks]))
-    if several:
-        lines += ["", "Success: mean and sample standard deviation over seeds."]
+    return FittedTable(
+        columns=columns, rows=rows, title=summary.policy, caption=_OVER_SEEDS if several else "", total=True
+    )
+
+
+def markdown(summary: CampaignSummary) -> str:
+    """The same table for ``report.md``."""
+    head, rows = _cells(summary)
+    lines = [f"# {summary.policy}", "", _line(head), _line(["---"] * len(head)), *map(_line, rows)]
+    if len(summary.seeds) > 1:
+        lines += ["", _OVER_SEEDS]
     return "\n".join(lines) + "\n"
+
+
+def _cells(summary: CampaignSummary) -> tuple[list[str], list[list[str]]]:
+    """Headings and rows, the last of which is the average."""
+    seeds = summary.seeds if len(summary.seeds) > 1 else ()
+    head = ["suite", "success", *(f"seed {seed}" for seed in seeds), "episodes", "no verdict"]
+    rows = []
+    for row in summary.suites:
+        each = [_percent(rate) for rate in row.rates[: len(seeds)]]
+        each += ["-"] * (len(seeds) - len(each))
+        rows.append([row.suite, _spread(row.mean, row.std), *each, str(row.episodes), str(row.errors + row.missing)])
+    average = ["average over suites", _spread(summary.average, summary.average_std)]
+    return head, [*rows, [*average, *[""] * (len(head) - 2)]]
 
 
 def _line(cells: Sequence[Any]) -> str:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 ALL = "all"
 VIDEO_CHOICES = ("none", "failures", "all")
 STORE_CHOICES = ("jsonl", "sqlite")
+TRACKERS = ("tensorboard", "trackio", "wandb")
+NO_TRACKER = "none"
 # Policies that know a benchmark's scenes, by the family of suites they are made for.
 SCRIPTED = {"libero": "pick_place", "simpler": "simpler_scripted"}
 _KEY = "setting"
@@ -180,6 +182,10 @@ class EvalConfig:
             "Run part i of n of the episodes: i/n; `vecenv merge` joins the parts.", default="all", decides=False
         ),
     )
+    track: str = field(
+        default=NO_TRACKER,
+        metadata=_about("Experiment trackers to log to: wandb, trackio, tensorboard, or several: a,b.", resumable=True),
+    )
     fail_fast: bool = field(default=False, metadata=_about("Stop when an error ends episodes.", resumable=True))
     engine: str = field(
         default="local",
@@ -198,6 +204,9 @@ class EvalConfig:
         parse_shard(self.shard)
         if self.cameras is not None and not self.camera_names:
             raise ConfigError(f"cameras={self.cameras!r}: no camera is named")
+        for name in self.trackers:
+            if name not in TRACKERS:
+                raise ConfigError(unknown("tracker", name, TRACKERS))
         for each in fields(self):
             value, minimum = getattr(self, each.name), setting(each).minimum
             if minimum is not None and value is not None and value < minimum:
@@ -223,6 +232,12 @@ class EvalConfig:
             return tuple(dict.fromkeys(int(text) for text in self.seeds.split(",")))
         except ValueError:
             raise ConfigError(f"seeds {self.seeds!r}: write whole numbers with commas: 0,1,2") from None
+
+    @property
+    def trackers(self) -> tuple[str, ...]:
+        """The experiment trackers to log to."""
+        names = (name.strip() for name in self.track.split(","))
+        return tuple(dict.fromkeys(name for name in names if name not in ("", NO_TRACKER)))
 
     @property
     def policy_name(self) -> str:
@@ -343,7 +358,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
     try:
         values = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: bytes, dates that are none
         raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected settings such as `suite: libero_object`, one a line")

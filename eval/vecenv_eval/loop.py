@@ -13,6 +13,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -123,6 +124,7 @@ class EpisodeLoop:
         except KeyboardInterrupt:
             return True
         finally:
+            self._progress.report_rest()
             self.close()
         return False
 
@@ -295,10 +297,11 @@ class EpisodeLoop:
     def _write(self, records: Sequence[Record]) -> None:
         self._store.append(records)
         self._records.update({record.key: record for record in records})
-        self._progress.count(self._records)
+        self._progress.note(records, self._records)
 
     def _write_conditions(self, env: BatchEnv) -> None:
-        self._store.write_conditions(conditions(env, self._config))
+        self._progress.conditions = conditions(env, self._config)
+        self._store.write_conditions(self._progress.conditions)
 
 
 class _Running:
@@ -355,15 +358,24 @@ class _ProgressReports:
 
     def __init__(self, on_progress: Callable[[Progress], None], total: int, records: dict[Episode, Record]) -> None:
         self.steps, self.seconds, self.num_batches = 0, 0.0, 0
-        self._on_progress, self._total = on_progress, total
-        self.count(records)
+        self.conditions: Mapping[str, Any] = {}
+        self._on_progress, self._total, self._batch = on_progress, total, 0
+        self._ended: list[Record] = []
+        self.note([], records)
 
-    def count(self, records: dict[Episode, Record]) -> None:
-        """Count the records there are now."""
+    def note(self, ended: Sequence[Record], records: dict[Episode, Record]) -> None:
+        """Some episodes have ended; ``records`` are all there are now."""
+        self._ended += ended
         self._counts = count(records.values())
+
+    def report_rest(self) -> None:
+        """Call ``on_progress`` if episodes have ended since it was called."""
+        if self._ended:
+            self.report(self._batch)
 
     def report(self, batch: int, setting_up: bool = False) -> None:
         """Call ``on_progress``."""
+        self._batch, ended, self._ended = batch, tuple(self._ended), []
         self._on_progress(
             Progress(
                 total=self._total,
@@ -373,5 +385,7 @@ class _ProgressReports:
                 batch=batch,
                 num_batches=self.num_batches,
                 setting_up=setting_up,
+                ended=ended,
+                conditions=self.conditions,
             )
         )

@@ -5,8 +5,8 @@ Records come in as episodes end; :class:`Progress` goes to whoever watches, :cla
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from vecenv_eval.store import CONFIG, Record, ResultStore, StoreError
 
 # Where ``config.json`` has the policy's name, which is known where the policy is made.
 POLICY_NAME = "policy_name"
+# In the folder of a campaign (``vecenv_eval.campaign``), whose runs have folders below it.
+CAMPAIGN = "campaign.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +31,10 @@ class Progress:
         successes, faults, errors: among the episodes so far.
         steps: control ticks executed in this run, summed over slots.
         seconds: seconds this run has spent running episodes.
-        batch, num_batches: which batch is running.
-        setting_up: the batch is being placed.
+        batch, num_batches: which stream of episodes is running, of how many.
+        setting_up: the environment of the stream is being built, or its episodes are being placed.
+        ended: the episodes that have ended since the last call, those that ended in an error included.
+        conditions: what episodes run under (``vecenv_eval.conditions``); empty until there is an environment.
     """
 
     total: int
@@ -43,6 +47,8 @@ class Progress:
     batch: int
     num_batches: int
     setting_up: bool
+    ended: tuple[Record, ...] = ()
+    conditions: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,3 +184,9 @@ def count(records: Iterable[Record]) -> dict[str, int]:
         "faults": sum(bool(record.fault) for record in records),
         "errors": errors,
     }
+
+
+def campaign_of(folder: Path) -> Path | None:
+    """The folder of the campaign that a results folder belongs to (``DIR/SUITE`` or ``DIR/seed-0/SUITE``), if any."""
+    above = folder.resolve().parents[:2]
+    return next((place for place in above if (place / CAMPAIGN).is_file()), None)

@@ -7,7 +7,9 @@ before anything is built, plans the streams of episodes, has an engine run them 
 
 from __future__ import annotations
 
+import functools
 import inspect
+import logging
 from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -16,16 +18,21 @@ from vecenv import family, protocols
 from vecenv.errors import VecenvError
 from vecenv.observations import UnknownCamera, choose_cameras
 from vecenv.placement import episode_indices
-from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy, parse_shard
+from vecenv.util.extras import how_to_install, is_installed
+from vecenv_eval.config import SCRIPTED, VIDEO_CHOICES, ConfigError, EvalConfig, default_policy, parse_shard
 from vecenv_eval.engine import EngineError, make_engine
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, shard
 from vecenv_eval.loop import make_streams
-from vecenv_eval.policies import Closing, Policy, Seeing, check_policy, make_policy
+from vecenv_eval.policies import Closing, Policy, Seeing, check_policy, make_policy, raised
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.results import POLICY_NAME, EvalResult, Progress, open_or_begin, write_results
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import RESULTS, ResultStore, default_folder
+from vecenv_eval.trackers import Tracking
+from vecenv_eval.trackers import require as require_trackers
+
+_log = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -120,13 +127,29 @@ class Evaluation:
             EngineError: the engine cannot run anything.
             StoreError: another process writes to the results folder, or it cannot be written.
         """
+        _warn_without_gpu(self.config.backend)
         try:
-            with store.writing():
-                return self._run(store, on_progress)
+            with store.writing(), Tracking(self.config, store) as tracking:
+
+                def report(progress: Progress) -> None:
+                    on_progress(progress)
+                    tracking.progress(progress)
+
+                result = self._run(store, report)
+                tracking.end(result)
+            return result
         finally:
             store.close()
-            if self._engine.in_process and isinstance(self.policy, Closing):
-                self.policy.close()
+            self._close_policy()
+
+    def _close_policy(self) -> None:
+        """Let the policy release what it holds; what it raises then costs no result."""
+        if not self._engine.in_process or not isinstance(self.policy, Closing):
+            return
+        try:
+            self.policy.close()
+        except Exception as error:
+            _log.warning("policy %r could not be closed: %s", self.policy.name, raised(error))
 
     def _run(self, store: ResultStore, on_progress: Callable[[Progress], None]) -> EvalResult:
         content = store.config()
@@ -154,6 +177,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     tasks, episodes = chosen_episodes(config, suite)
     _check_make(simulator, config)
     check_cameras(config, suite, tasks)
+    _check_packages(config)
     _check_policy(config)
     check_policy(config.policy_name, **config.policy_args)
     make_engine(config)
@@ -228,3 +252,30 @@ def _cameras_of(config: EvalConfig, suite: Suite, task: int) -> tuple[str, ...]:
     added = render.get("cameras", ()) if isinstance(render, Mapping) else ()
     names = [str(each.get("name")) if isinstance(each, Mapping) else str(getattr(each, "name", "")) for each in added]
     return (*suite.cameras[task], *names)
+
+
+def _check_packages(config: EvalConfig) -> None:
+    """Refuse what needs a package that is not installed, before the first episode would fail for want of it."""
+    require_trackers(config.trackers)
+    needs = {
+        "--record": ("h5py",) if config.records else (),
+        f"--video {config.video}": ("av",) if config.video != VIDEO_CHOICES[0] else (),
+        "--record-lerobot": ("pyarrow", "av") if config.record_lerobot else (),
+    }
+    for option, modules in needs.items():
+        for module in modules:
+            if not is_installed(module):
+                raise ConfigError(f"{option}: {how_to_install(module)}")
+
+
+@functools.cache
+def _warn_without_gpu(backend: str) -> None:
+    """Say once that MuJoCo Warp runs on the CPU, where there is no other device."""
+    if backend != "warp":
+        return
+    import jax
+
+    if jax.default_backend() not in ("gpu", "cuda"):
+        _log.warning(
+            "--backend warp: no CUDA device: this runs on the CPU and is slow (--backend native is fast there)"
+        )

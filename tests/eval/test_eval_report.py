@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from vecenv_eval.episodes import Episode
-from vecenv_eval.report import Summary, closing_line, markdown, summarise, table, wilson
+from vecenv_eval.report import Summary, closing_line, markdown, sanitized_line, summarise, table, wilson
 from vecenv_eval.store import Record
 
 PLANNED = [Episode("s", task, episode) for task in range(2) for episode in range(4)]
@@ -133,3 +133,11 @@ def test_what_the_policy_reports_is_averaged_or_counted() -> None:
     assert "- calls: 3" in page
     assert "- cause: 2 x dropped it" in page
     assert "Reported" not in markdown(summary(record(0, 0)))
+
+
+def test_sanitised_actions_are_told() -> None:
+    clean, changed = summary(record(0, 0)), summary(record(0, 0, sanitized=3), record(0, 1, sanitized=1), record(1, 0))
+    assert (clean.sanitized, sanitized_line(clean)) == (0, "")
+    assert "Sanitised" not in markdown(clean)
+    assert sanitized_line(changed).startswith("Sanitised actions in 2 episodes")
+    assert sanitized_line(changed) in markdown(changed)

@@ -28,7 +28,7 @@ def merge_command(
 
     from vecenv.errors import MissingDependency, VecenvError
     from vecenv_eval.campaign import markdown
-    from vecenv_eval.cli.eval import print_result
+    from vecenv_eval.cli.screen import print_result
     from vecenv_eval.merge import merge
 
     console = Console(quiet=quiet)

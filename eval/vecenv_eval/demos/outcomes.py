@@ -9,10 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich import box
-from rich.table import Table
-from rich.text import Text
-
+from vecenv.util.tables import Column, FittedTable
 from vecenv_eval.demos.hdf5 import Unreadable
 from vecenv_eval.report import CONFIDENCE, wilson
 
@@ -90,18 +87,18 @@ class ReplayReport:
         }
 
 
-def table(report: ReplayReport) -> Table:
+def table(report: ReplayReport) -> FittedTable:
     """The outcomes as a table for the screen; with file names where a task has several files."""
     named = {outcome.path: (outcome.suite, outcome.task) for outcome in report.outcomes}
     several = len(set(named.values())) < len(named)
-    result = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    result.collapse_padding = True
-    for column in ("task", "demo", "recorded", "replayed", "ticks", "max |dq|", *(["file"] if several else []), "note"):
-        free = column in ("file", "note")
-        result.add_column(column, justify="left" if free or column == "task" else "right", no_wrap=not free)
-    for outcome in report.outcomes:
-        result.add_row(*map(Text, _cells(outcome, several)), style="red" if outcome.agrees is False else None)
-    return result
+    columns = [Column("task", key=True), Column("demo", key=True, justify="right")]
+    columns += [Column(name, justify="right") for name in ("recorded", "replayed", "ticks", "max |dq|")]
+    columns += [Column(name, text=True) for name in (*(["file"] if several else []), "note")]
+    return FittedTable(
+        columns=columns,
+        rows=[_cells(outcome, several) for outcome in report.outcomes],
+        styles={number: "red" for number, outcome in enumerate(report.outcomes) if outcome.agrees is False},
+    )
 
 
 def _cells(outcome: Outcome, named: bool) -> list[str]:

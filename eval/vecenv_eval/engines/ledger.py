@@ -6,7 +6,7 @@ later error change nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from vecenv_eval.engines.ray_actor import Report
@@ -38,6 +38,7 @@ class Ledger:
         wanted = frozenset(self._planned)
         self._records = {key: r for key, r in store.records().items() if key in wanted and not r.error}
         self._conditions: dict[str, Any] | None = None
+        self._ended: list[Record] = []
 
     @property
     def missing(self) -> list[Episode]:
@@ -48,6 +49,16 @@ class Ledger:
     def counts(self) -> dict[str, int]:
         """The counts of :class:`~vecenv_eval.results.Progress`."""
         return {"total": len(self._planned), **count(self._records.values())}
+
+    @property
+    def conditions(self) -> Mapping[str, Any]:
+        """What the episodes run under; empty until an environment was made."""
+        return self._conditions or {}
+
+    def take_ended(self) -> tuple[Record, ...]:
+        """The records that were written since the last call."""
+        ended, self._ended = tuple(self._ended), []
+        return ended
 
     def receive(self, report: Report) -> None:
         """Write what a report brings that is not there yet."""
@@ -110,6 +121,7 @@ class Ledger:
         if not records:
             return
         self._store.append(records)
+        self._ended += records
         self._records.update({record.key: record for record in records})
         for record in records:
             if record.error:

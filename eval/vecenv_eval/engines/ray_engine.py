@@ -273,6 +273,8 @@ class _Driver:
                 batch=self._finished,
                 num_batches=self._units + self._queue.units,
                 setting_up=self._reports == 0,
+                ended=self._ledger.take_ended(),
+                conditions=self._ledger.conditions,
             )
         )
         self._reports += 1

@@ -21,7 +21,7 @@ import submitit
 from submitit.core.utils import FailedJobError
 
 from vecenv.util.names import unknown
-from vecenv_eval.config import ConfigError, EvalConfig, from_values
+from vecenv_eval.config import NO_TRACKER, ConfigError, EvalConfig, from_values
 from vecenv_eval.engine import EngineError, Outcome
 from vecenv_eval.engines.ray_options import needs_gpu
 from vecenv_eval.engines.shard_job import ShardJob, ShardOutcome
@@ -218,7 +218,8 @@ class _Driver:
         self._causes: dict[str, None] = {}
         self._refused = self._unsubmitted = ""
         self._began = self._asked = time.monotonic()
-        self._before = sum(record.num_steps for record in ResultStore(folder).records().values())
+        self._seen = ResultStore(folder).records()
+        self._before = sum(record.num_steps for record in self._seen.values())
         self._merged, self._reports = -1, 0
 
     def run(self) -> Outcome:
@@ -308,7 +309,10 @@ class _Driver:
         self._report()
 
     def _report(self) -> None:
-        records = ResultStore(self._folder).records()
+        store = ResultStore(self._folder)
+        records = store.records()
+        ended = tuple(record for key, record in records.items() if self._seen.get(key) != record)
+        self._seen = records
         self._on_progress(
             Progress(
                 total=len(self._evaluation.planned),
@@ -318,6 +322,8 @@ class _Driver:
                 batch=sum(shard.finished for shard in self._shards),
                 num_batches=len(self._shards),
                 setting_up=self._reports == 0,
+                ended=ended,
+                conditions=store.config().get("conditions", {}),
             )
         )
         self._reports += 1
@@ -333,7 +339,7 @@ class _Driver:
 
 
 def _shard(evaluation: Evaluation, folder: Path, part: int, parts: int) -> Shard:
-    config = replace(evaluation.config, shard=f"{part}/{parts}", engine="local", engine_args={})
+    config = replace(evaluation.config, shard=f"{part}/{parts}", engine="local", engine_args={}, track=NO_TRACKER)
     tasks, episodes = chosen_episodes(config, evaluation.suite)
     planned = [Episode(evaluation.suite.name, task, each) for task in tasks for each in episodes[task]]
     place = folder / SHARDS / f"{part}-of-{parts}"

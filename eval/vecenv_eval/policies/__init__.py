@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
@@ -128,9 +129,16 @@ def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
         **arguments: constructor arguments.
 
     Raises:
-        PolicyError: the name is unknown, its module does not import, or it does not take the arguments.
+        PolicyError: the name is unknown, its module does not import, it does not take the arguments, or it raises an
+            exception.
     """
-    policy = _bound(name, seed, arguments)()
+    factory = _bound(name, seed, arguments)
+    try:
+        policy = factory()
+    except PolicyError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever a policy's constructor raises
+        raise PolicyError(f"policy {name!r}: making it failed: {raised(error)}") from error
     if not isinstance(policy, Policy):
         raise PolicyError(f"policy {name!r} is not a policy: it needs a name, reset(env, info) and act(env)")
     return policy
@@ -163,11 +171,20 @@ def _load(name: str) -> Callable[..., object]:
         raise PolicyError(f"unknown policy {name!r}: did you mean {', '.join(close)}? Your own go by 'module:Class'")
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:
-        raise PolicyError(
-            f"policy {name!r}: importing {module_name!r} failed: {type(error).__name__}: {error}"
-        ) from error
+    except (Exception, SystemExit) as error:  # whatever a module raises, a script that ends with sys.exit() included
+        raise PolicyError(f"policy {name!r}: importing {module_name!r} failed: {raised(error)}") from error
     factory = getattr(module, attribute, None)
     if not callable(factory):
         raise PolicyError(f"policy {name!r}: the module {module_name!r} has no class {attribute!r}")
     return factory
+
+
+def raised(error: BaseException) -> str:
+    """An exception in a sentence: its type, its message, and the file and line that raised it."""
+    text = " ".join(f"{type(error).__name__}: {error}".rstrip(": ").split())
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [
+        frame for frame in frames if not frame.filename.startswith("<frozen") and frame.filename != importlib.__file__
+    ]
+    # Of an error in this file, such as a module that is not there, the line says nothing to the user.
+    return f"{text} ({own[-1].filename}:{own[-1].lineno})" if own and own[-1].filename != __file__ else text

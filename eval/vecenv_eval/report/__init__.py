@@ -1,7 +1,7 @@
 """Reports about evaluations: numbers, tables, and the page of ``vecenv report``."""
 
 from vecenv_eval.report.summary import CONFIDENCE, TOTAL, Row, Summary, summarise, wilson
-from vecenv_eval.report.tables import STAND_INS, closing_line, markdown, stand_in_lines, table
+from vecenv_eval.report.tables import STAND_INS, closing_line, markdown, sanitized_line, stand_in_lines, table
 
 __all__ = [
     "CONFIDENCE",
@@ -11,6 +11,7 @@ __all__ = [
     "Summary",
     "closing_line",
     "markdown",
+    "sanitized_line",
     "stand_in_lines",
     "summarise",
     "table",

@@ -92,6 +92,7 @@ class Summary:
         stand_ins: how many episodes ran with what in place of a missing file.
         conditions: what the episodes ran under, see ``vecenv_eval.conditions``; empty when no environment was made.
         parts: the intermediate results of the success check, task by task; SIMPLER's tasks have some.
+        sanitized: episodes with actions that were not finite or out of range, and were changed.
     """
 
     suite: str
@@ -106,6 +107,7 @@ class Summary:
     stand_ins: Mapping[str, int] = field(default_factory=dict)
     conditions: Mapping[str, Any] = field(default_factory=dict)
     parts: tuple[PartRow, ...] = ()
+    sanitized: int = 0
 
     @property
     def complete(self) -> bool:
@@ -169,6 +171,7 @@ def summarise(
         stand_ins=dict(Counter(note for record in found for note in record.stand_ins).most_common()),
         conditions=conditions or {},
         parts=tuple(part for task in tasks for part in _parts(task, [r for r in found if r.task == task])),
+        sanitized=sum(bool(record.sanitized) for record in found),
     )
 
 

@@ -6,11 +6,7 @@ A :class:`~vecenv_eval.report.summary.Summary` comes in and a table goes out: wh
 
 from __future__ import annotations
 
-from rich import box
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
-
+from vecenv.util.tables import Column, FittedTable
 from vecenv_eval.conditions import describe
 from vecenv_eval.report.summary import PartRow, Row, Summary
 
@@ -23,22 +19,21 @@ _COLUMNS = ("task", _TEXT, "solved", "rate", "95 % interval", "steps", "faults",
 _PROBLEMS = 3
 
 
-def table(summary: Summary) -> Table:
+def table(summary: Summary) -> FittedTable:
     """The summary as a table for the screen; columns of faults, errors and missing episodes only if there are any."""
     rows = [_cells(row) for row in (*summary.tasks, summary.total)]
     healthy = rows[-1][-_PROBLEMS:] == ["0"] * _PROBLEMS
-    shown = len(_COLUMNS) - (_PROBLEMS if healthy else 0)
-    title = f"{escape(summary.suite)} · {escape(summary.policy)}"
-    result = Table(title=title, caption=escape(describe(summary.conditions)), box=box.SIMPLE_HEAD, pad_edge=False)
-    result.collapse_padding = True
-    for column in _COLUMNS[:shown]:  # rich narrows only columns that may wrap: here the text, never a number
-        result.add_column(column, justify="left" if column == _TEXT else "right", no_wrap=column != _TEXT)
-    for cells in rows:
-        if cells is rows[-1]:
-            result.add_section()
-        texts = [Text(cell, no_wrap=True, overflow="ellipsis") for cell in cells[:shown]]
-        result.add_row(*texts, style="bold" if cells is rows[-1] else None)
-    return result
+    shown = _COLUMNS[: len(_COLUMNS) - (_PROBLEMS if healthy else 0)]
+    return FittedTable(
+        columns=[
+            Column(name, text=name == _TEXT, key=name == "task", justify="left" if name == _TEXT else "right")
+            for name in shown
+        ],
+        rows=[cells[: len(shown)] for cells in rows],
+        title=f"{summary.suite} · {summary.policy}",
+        caption=describe(summary.conditions),
+        total=True,
+    )
 
 
 def markdown(summary: Summary) -> str:
@@ -51,7 +46,9 @@ def markdown(summary: Summary) -> str:
     missing = ["", f"{STAND_INS}:", "", *stand_in_lines(summary)] if summary.stand_ins else []
     ran_under = ["", describe(summary.conditions)] if summary.conditions else []
     parts = ["", PARTS, "", *_parts_lines(summary)] if summary.parts else []
-    return "\n".join([title, *ran_under, "", *lines, "", closing_line(summary), *parts, *missing, *reported, ""])
+    sanitized = ["", sanitized_line(summary)] if summary.sanitized else []
+    after = [*sanitized, *parts, *missing, *reported]
+    return "\n".join([title, *ran_under, "", *lines, "", closing_line(summary), *after, ""])
 
 
 def closing_line(summary: Summary) -> str:
@@ -70,6 +67,13 @@ def _verdicts(total: Row) -> str:
     if total.first == total.final:
         return ""
     return f"The goal held at some tick in {total.first} and at the last tick in {total.final} of them. "
+
+
+def sanitized_line(summary: Summary) -> str:
+    """How many episodes had actions that were not executed as they were, in a sentence; "" for none."""
+    if not summary.sanitized:
+        return ""
+    return f"Sanitised actions in {summary.sanitized} episodes: not finite (set to 0) or out of range (clipped)."
 
 
 def stand_in_lines(summary: Summary) -> list[str]:

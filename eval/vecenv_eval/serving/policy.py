@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 
 from vecenv.errors import InvalidInput
+from vecenv_eval.policies import raised
 
 # What the protocol delivers for one slot: arrays and texts by the protocol's own names, without a batch axis.
 Observation: TypeAlias = Mapping[str, Any]
@@ -99,10 +100,13 @@ def load(name: str) -> Served:
         raise ServedPolicyError(f"policy {name!r}: write module:Name")
     try:
         found: Any = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ServedPolicyError(f"policy {name!r}: {type(error).__name__}: {error}") from error
+    except (Exception, SystemExit) as error:  # whatever a module raises
+        raise ServedPolicyError(f"policy {name!r}: {raised(error)}") from error
     is_policy = not isinstance(found, type) and isinstance(found, ServedPolicy | InferPolicy)
-    policy: Any = found if is_policy or not callable(found) else found()
+    try:
+        policy: Any = found if is_policy or not callable(found) else found()
+    except (Exception, SystemExit) as error:  # whatever a policy's constructor raises
+        raise ServedPolicyError(f"policy {name!r}: making it failed: {raised(error)}") from error
     return Served(policy)
 
 
