@@ -15,6 +15,7 @@ from vecenv_eval.config import EvalConfig
 from vecenv_eval.demos.files import find_files, read_files
 from vecenv_eval.demos.outcomes import ReplayReport
 from vecenv_eval.demos.replay import OTHER_FILES, ReplayConfig, replay
+from vecenv_eval.report.html import page
 from vecenv_eval.report.run import read_run
 from vecenv_eval.results import EvalResult, begin, resume
 from vecenv_eval.runner import evaluate
@@ -193,8 +194,10 @@ def test_parts_of_success_are_in_records_summary_and_report(solved: Path) -> Non
     assert "| 1 | src_on_target | 2/2 | 100.0% |" in (solved / "report.md").read_text()
     first = json.loads((solved / "episodes.jsonl").read_text().splitlines()[0])
     assert first["parts"] == {**dict.fromkeys(PARTS, True), "moved_wrong_obj": False}
-    (suite,) = read_run(solved).suites
-    assert suite.summary.parts == result.summary.parts
+    read = read_run(solved)
+    assert read.suites[0].summary.parts == result.summary.parts
+    shown = page(read, out=solved / "report.html")
+    assert '<td>src_on_target</td><td class="n">2/2</td><td class="n">100.0%</td>' in shown
 
 
 def test_a_part_that_is_a_number_is_averaged(tmp_path: Path) -> None:
@@ -207,6 +210,8 @@ def test_a_part_that_is_a_number_is_averaged(tmp_path: Path) -> None:
     assert part.mean is not None
     assert part.mean > 0.1  # metres: the drawer begins open
     assert f"| qpos | 2 | mean {part.mean:.4g} |" in (tmp_path / "r" / "report.md").read_text()
+    shown = page(read_run(tmp_path / "r"), out=tmp_path / "report.html")
+    assert all(f"qpos {value}" in shown for value in opened)  # of each episode that failed
 
 
 def test_parts_that_are_none_are_refused_in_a_report(solved: Path, tmp_path: Path) -> None:

@@ -153,3 +153,23 @@ def test_every_tick_of_a_batch_is_a_frame_and_the_last_shows_the_verdicts(tmp_pa
     green, red = frames[-1][1, 10], frames[-1][1, -10]
     assert green[1] > green[0]
     assert red[0] > red[1]
+
+
+@pytest.mark.parametrize("control_hz", [3, 5, 20])
+def test_a_rollouts_video_runs_at_its_robots_rate(tmp_path: Path, control_hz: int) -> None:
+    av = pytest.importorskip("av")
+    pytest.importorskip("PIL")
+    from vecenv_eval.rollout import record_rollout
+
+    env: Any = Countdown()
+    env.num_envs, env.control_hz = 2, control_hz
+
+    def step(actions: Any) -> Any:
+        env.step()
+        return SimpleNamespace(done=np.array([env.ticks >= 2, env.ticks >= 6]), step_index=np.full(2, env.ticks))
+
+    env.step_continuous = step
+    policy: Any = SimpleNamespace(name="still", reset=lambda *_: None, act=lambda _: None)
+    assert record_rollout(env, policy, tmp_path / "v.mp4", ["agentview"]) == 7
+    with av.open(str(tmp_path / "v.mp4")) as video:
+        assert video.streams.video[0].average_rate == control_hz

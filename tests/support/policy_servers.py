@@ -45,9 +45,6 @@ class SeeingEnv(FakeEnv):
     def placement(self) -> Placement:
         return Placement(self.tasks, self.episodes)
 
-    def instructions(self) -> tuple[str, ...]:
-        return self.reset().instruction
-
     def observe_egocentric(self, slots: Any = None) -> Egocentric:
         slots = np.arange(self.num_envs, dtype=np.uint8)
         shape = (self.num_envs, SIZE, SIZE, 3)
