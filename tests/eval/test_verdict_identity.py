@@ -18,6 +18,7 @@ from vecenv_eval import policies
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.policies.pick_place.policy import PickPlacePolicy
 from vecenv_eval.policies.random import RandomPolicy
+from vecenv_eval.policies.voxposer import VoxPoserPolicy
 from vecenv_eval.results import begin, resume
 from vecenv_eval.runner import evaluate
 from vecenv_eval.store import EPISODES, ResultStore
@@ -106,3 +107,39 @@ def test_rows_of_published_protocols_do_not_depend_on_the_batch(tmp_path: Path, 
 def test_rows_do_not_depend_on_how_scenes_share_the_slots(tmp_path: Path) -> None:
     settings = {"suite": "libero_object", "tasks": "0-2", "episodes": "3", "max_steps": 10}
     assert run(tmp_path / "few", "random", num_envs=4, **settings) == run(tmp_path / "all", "random", **settings)
+
+
+class Planned(VoxPoserPolicy):
+    """VoxPoser, with a hash of the state that each episode ended in in its record."""
+
+    env: BatchEnv
+
+    def reset(self, env: BatchEnv, info: ResetInfo) -> None:
+        self.env = env
+        super().reset(env, info)
+
+    def extras(self, slot: int) -> dict[str, Any]:
+        state, said = self.env.state(), super().extras(slot)
+        ended = hashlib.sha256(state.qpos[slot].tobytes() + state.qvel[slot].tobytes()).hexdigest()
+        return {"ended": ended, **{name: said[name] for name in ("subtasks", "waypoints", "cause")}}
+
+
+class PlannedInBatches:
+    """The same without single slots: a batch waits for its slowest episode."""
+
+    name = "planned"
+
+    def __init__(self) -> None:
+        self._policy = Planned()
+        self.name = self._policy.name
+        self.reset, self.act, self.extras = self._policy.reset, self._policy.act, self._policy.extras
+
+
+def test_rows_of_voxposer_are_those_of_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"suite": "libero_object", "tasks": "0,3", "episodes": "3", "max_steps": 130}
+    monkeypatch.setattr(policies, "_load", lambda name: PlannedInBatches)
+    batches = run(tmp_path / "batches", "voxposer", num_envs=6, **settings)
+    monkeypatch.setattr(policies, "_load", lambda name: Planned)
+    refilled = run(tmp_path / "refilled", "voxposer", num_envs=4, **settings)
+    assert refilled == batches
+    assert len(set(refilled)) == 6
