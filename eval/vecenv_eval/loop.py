@@ -157,12 +157,10 @@ class EpisodeLoop:
         ended = 0
 
         def refill(done: np.ndarray) -> np.ndarray:
-            nonlocal ended
             rows = running.slots_to_refill(done, self._refill_share)
             if len(rows):
-                ended += int(env.evaluate().num_steps[rows].sum())
                 began = clocks.now()
-                running.refill(rows)
+                running.refill(rows, done)
                 assert isinstance(self._policy, Refillable)
                 self._policy.reset_slots(env, running.info, rows)
                 begin(rows.tolist(), [running.slots[row].episode for row in rows.tolist()])
@@ -175,6 +173,7 @@ class EpisodeLoop:
             clocks.tick(control)
             if finished.any():
                 metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
+                ended += int(metrics.num_steps[finished].sum())
                 finish(finished, metrics.success, control.info["fault"])
                 records = [self._record(number, running, i, metrics, control, clocks) for i in slots]
                 self._finish_watchers(env, slots, records)
@@ -182,7 +181,7 @@ class EpisodeLoop:
                 self._verdicts += len(slots)
                 self._tell_policy(running, slots)
             progress.steps, progress.seconds = (
-                before[0] + ended + int(control.step_index.sum()),
+                before[0] + ended + int(control.step_index[~control.done].sum()),
                 before[1] + clocks.now(),
             )
             progress.report(number)
@@ -318,8 +317,13 @@ class _Running:
         enough = len(rows) >= share * len(done) or done.all()
         return np.array(rows if enough else [], int)
 
-    def refill(self, rows: np.ndarray) -> None:
-        """Place the next episode of their scene in finished slots, and reset them."""
+    def refill(self, rows: np.ndarray, done: np.ndarray) -> None:
+        """Place the next episode of their scene in finished slots, and reset them.
+
+        Args:
+            rows: the slots.
+            done: every slot that has finished, bool [B]; those without a next episode stay finished.
+        """
         for row in rows.tolist():
             self.slots[row] = self._waiting[self._suite.scenes[self.slots[row].task]].popleft()
         chosen = [self.slots[row] for row in rows.tolist()]
@@ -327,6 +331,10 @@ class _Running:
         env.set_episodes(tasks=[e.task for e in chosen], episodes=[e.episode for e in chosen], slots=rows)
         self.info = env.reset()
         slots_of(self.info, self.slots)
+        # A reset begins every finished slot anew; nobody is to step or to watch those that have nothing left to run.
+        over = done.copy()
+        over[rows] = False
+        env.end_episodes(over)
 
     def rest(self, num_slots: int) -> Stream:
         """The episodes that have not begun, for as many slots."""
