@@ -6,8 +6,8 @@ motions, the planner turns the value maps of all slots into paths in one call, a
 all plans. Objects that are to be moved without a grasp are pushed, one push a round. A slot whose program fails, or for
 which there is no path, is stopped with its cause (``voxposer.slots``) and holds still; the other slots continue.
 
-Nothing that a slot does depends on the others: in a round it executes its own plan and no tick more, so a slot may begin
-another episode (:meth:`Agent.begin`) while the others are anywhere in theirs.
+Nothing that a slot does depends on the others: in a round it executes its own plan and no tick more, so a slot may
+begin another episode (:meth:`Agent.begin`) while the others are anywhere in theirs.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 It follows the instruction of each slot with ``voxposer.agent`` and reports, an episode: subtasks, waypoints, questions
 to the language model and their cost, and why a failed one failed. A slot whose episode has ended begins the next one in
-the agent's next round, while the others are between subtasks of theirs. The model is ``offline/libero`` unless another is
-named: a rule-based writer of programs, no language model at all. The policy's name says which it was.
+the agent's next round, while the others are between subtasks of theirs. The model is ``offline/libero`` unless another
+is named: a rule-based writer of programs, no language model at all. The policy's name says which it was.
 """
 
 from __future__ import annotations
