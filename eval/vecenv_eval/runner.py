@@ -8,7 +8,9 @@ before anything is built, plans the batches, runs them (``vecenv_eval.loop``) an
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Callable, Collection
+from functools import cached_property
 from pathlib import Path
 
 from vecenv import family, protocols
@@ -18,12 +20,15 @@ from vecenv_eval.config import SCRIPTED, ConfigError, EvalConfig, default_policy
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, plan, streams
 from vecenv_eval.loop import EpisodeLoop
+from vecenv_eval.memory import SlotChoice, choose_slots
 from vecenv_eval.policies import Closing, Refillable, check_policy, make_policy
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.report import markdown, summarise
 from vecenv_eval.results import EvalResult, Progress, begin
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import RESULTS, ResultStore, default_folder
+
+_log = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -78,9 +83,14 @@ class Evaluation:
         """Every episode asked for, task by task."""
         return tuple(Episode(self.suite.name, task, e) for task in self.tasks for e in self.episodes[task])
 
+    @cached_property
+    def slots(self) -> SlotChoice:
+        """How many slots run at once; chosen once, before environments take memory."""
+        return choose_slots(self.config, self.suite, self.tasks, self.simulator)
+
     def streams(self, done: Collection[Episode] = ()) -> list[Stream]:
         """What runs the planned episodes but those in ``done``; batches, if the policy cannot begin single slots."""
-        most = self.suite.max_slots if self.config.num_envs is None else self.config.num_envs
+        most = self.slots.num_envs
         if isinstance(self.policy, Refillable):
             return streams(self.suite, self.tasks, self.episodes, num_envs=most, done=done)
         return [Stream.of(b) for b in plan(self.suite, self.tasks, self.episodes, num_envs=most, done=done)]
@@ -94,7 +104,9 @@ class Evaluation:
             ConfigError: the environment refuses a setting; a results folder without episodes is removed.
         """
         content = store.config()
-        store.write_config({**content, "runs": [*content["runs"], run_conditions()]})
+        _log.info("at most %d slots: %s", self.slots.num_envs, self.slots.reason)
+        slots = {"num_envs": self.slots.num_envs, "num_envs_reason": self.slots.reason}
+        store.write_config({**content, "runs": [*content["runs"], run_conditions() | slots]})
         loop = EpisodeLoop(
             self.config,
             self.suite,
