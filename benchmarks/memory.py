@@ -32,7 +32,7 @@ CASES: tuple[tuple[str, tuple[int, ...], bool, tuple[int, int]], ...] = (
     ("libero_object", (0,), True, (8, 40)),
     ("libero_spatial", (0,), True, (8, 40)),
     ("libero_10", (0,), True, (8, 40)),
-    ("libero_10", (0, 1, 2, 3, 4), True, (10, 40)),
+    ("libero_10", (0, 1, 2, 3, 4), True, (5, 20)),
     ("simpler/bridge", (0,), False, (8, 24)),
     ("simpler/bridge", (0,), True, (8, 24)),
     ("simpler/google_robot", (0,), False, (8, 24)),

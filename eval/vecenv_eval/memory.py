@@ -4,7 +4,21 @@ The settings of a run and the memory that is free come in; a :class:`SlotChoice`
 batch takes a fixed amount, more for every scene, and more for every slot (:class:`Footprint`). A quarter of the memory
 at hand is left alone. Verdicts do not depend on the number.
 
-@@TABLE@@
+Figures are largest resident sizes, ``python benchmarks/memory.py`` on 2 cores (2 threads or processes), rounded up to
+those of the largest suite. MiB, measured:
+
+================================  ========================================================================
+native, no images                 a slot 0.53 (libero_object), 1.0 (libero_spatial), 0.74 (libero_10);
+                                  fixed 393, 318, 351, the last with five scenes
+native, two images of 256 pixels  a slot 4.7, 4.6, 4.5; fixed with one scene 1,733, 1,889, 2,187;
+                                  libero_10 with five scenes and five slots: 3,829 together
+SIMPLER, no images                309 and 199 a worker process (8 slots); together 741 and 714 with 4 and
+                                  12 slots (bridge), 728 and 733 (google_robot)
+warp                              a world 1.9 (libero_object), 3.9 (libero_spatial): docs/mjx.md
+================================  ========================================================================
+
+Not measured: SIMPLER's images, which are taken to need as much as LIBERO's, and ``backend="jax"``, which is taken to
+need what warp needs.
 """
 
 from __future__ import annotations
@@ -61,11 +75,10 @@ class SlotChoice:
 
 DEVICE_BACKENDS = ("warp", "jax", "mjx")
 NATIVE = Footprint(fixed=400, scene=0, slot=1.0)
-NATIVE_IMAGES = Footprint(fixed=800, scene=1000, slot=6.0)
-SIMPLER = Footprint(fixed=400, scene=0, slot=20.0)
-SIMPLER_IMAGES = Footprint(fixed=400, scene=0, slot=40.0)
-# A worker process of SIMPLER.
-PROCESS = 300
+NATIVE_IMAGES = Footprint(fixed=1800, scene=450, slot=5.0)
+SIMPLER = Footprint(fixed=320, scene=0, slot=1.0)
+# What a worker process of SIMPLER takes.
+PROCESS = 200
 WORLDS = Footprint(fixed=0, scene=0, slot=4.0)
 
 
@@ -94,9 +107,9 @@ def footprint(config: EvalConfig, simulator: Simulator) -> Footprint:
     """What a batch of a run takes in main memory, or on the device for MJX."""
     images = draws_images(config)
     if family(config.suite) == protocols.SIMPLER:
-        table = SIMPLER_IMAGES if images else SIMPLER
         processes = config.num_threads or usable_cores()
-        return Footprint(fixed=table.fixed + PROCESS * processes, scene=table.scene, slot=table.slot)
+        slot = NATIVE_IMAGES.slot if images else SIMPLER.slot
+        return Footprint(fixed=SIMPLER.fixed + PROCESS * processes, scene=SIMPLER.scene, slot=slot)
     if config.backend in DEVICE_BACKENDS:
         return WORLDS
     if not images:
