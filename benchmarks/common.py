@@ -45,6 +45,29 @@ def report(
     return path
 
 
+def fill_table(name: str, results: Path, page: Path) -> str:
+    """Put the rows of a results file as a Markdown table between ``<!-- name -->`` and ``<!-- end name -->`` of a page.
+
+    Returns:
+        The table.
+
+    Raises:
+        SystemExit: there are no results yet, or the page has no such place.
+    """
+    if not results.is_file():
+        raise SystemExit(f"{results}: no such file; run the benchmark first")
+    rows = json.loads(results.read_text())["rows"]
+    columns = list(rows[0])
+    lines = [columns, ["---"] * len(columns), *([show(row[column]) for column in columns] for row in rows)]
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    before, opening, rest = page.read_text().partition(f"<!-- {name} -->\n")
+    _, closing, after = rest.partition(f"<!-- end {name} -->")
+    if not (opening and closing):
+        raise SystemExit(f"{page}: no place for the table: <!-- {name} --> and <!-- end {name} -->")
+    page.write_text(f"{before}{opening}{table}\n{closing}{after}")
+    return table
+
+
 def show(value: object) -> str:
     """A cell: small floats in scientific notation, others with three significant digits."""
     if isinstance(value, float):

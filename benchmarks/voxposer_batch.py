@@ -2,6 +2,12 @@
 
 Both run in this process through the evaluation harness, with the offline model (rule-based, no language model), whose
 replies the first run leaves behind for the second: one episode is run beforehand, so that neither pays for compiling.
+
+    python benchmarks/voxposer_batch.py
+    python benchmarks/voxposer_batch.py --slots 8 --episodes 24
+
+With ``--slots`` it compares slots that take the next episode when theirs has ended with batches of as many slots, which
+wait for their slowest episode.
 """
 
 from __future__ import annotations
@@ -13,7 +19,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from common import report
+from vecenv_eval import policies
 from vecenv_eval.config import EvalConfig
+from vecenv_eval.policies.voxposer import VoxPoserPolicy
 from vecenv_eval.results import EvalResult, begin
 from vecenv_eval.runner import evaluate
 
@@ -24,8 +32,12 @@ def main() -> None:
     parser.add_argument("--suite", default="libero_object")
     parser.add_argument("--task", default="0")
     parser.add_argument("--episodes", default="all")
+    parser.add_argument("--slots", type=int, help="refilled slots against batches of so many")
     options = parser.parse_args()
     run(options, 1, "0-0")
+    if options.slots:
+        compare_refilled(options)
+        return
     together, seconds = run(options, 50, options.episodes)
     alone, one_by_one = run(options, 1, options.episodes)
     pairs = list(zip(together.records, alone.records, strict=True))
@@ -40,6 +52,42 @@ def main() -> None:
         "ticks differ": sum(a.num_steps != b.num_steps for a, b in pairs),
     }
     report("voxposer_batch", [row], title="VoxPoser (offline/libero): a batch against one episode at a time")
+
+
+class InBatches:
+    """VoxPoser without ``reset_slots``, so that the harness runs batches, each to its end."""
+
+    def __init__(self) -> None:
+        policy = VoxPoserPolicy()
+        self.name, self.reset, self.act, self.extras = policy.name, policy.reset, policy.act, policy.extras
+
+
+def compare_refilled(options: argparse.Namespace) -> None:
+    """One row of refilled slots against batches; a run beforehand leaves the replies behind for both."""
+    load = policies._load
+    run(options, options.slots, options.episodes)
+    policies._load = lambda name: InBatches
+    begun = time.process_time()
+    batches, waiting = run(options, options.slots, options.episodes)
+    policies._load = load
+    between = time.process_time()
+    refilled, seconds = run(options, options.slots, options.episodes)
+    cpu = between - begun, time.process_time() - between
+    pairs = list(zip(refilled.records, batches.records, strict=True))
+    row = {
+        "task": f"{options.suite}/{options.task}",
+        "batches / refilled": round(waiting / seconds, 2),
+        "refilled s": round(seconds, 1),
+        "batches s": round(waiting, 1),
+        "refilled CPU s": round(cpu[1], 1),
+        "batches CPU s": round(cpu[0], 1),
+        "slots": options.slots,
+        "episodes": len(pairs),
+        "solved": sum(a.success for a, _ in pairs),
+        "verdicts differ": sum(a.success != b.success for a, b in pairs),
+        "ticks differ": sum(a.num_steps != b.num_steps for a, b in pairs),
+    }
+    report("voxposer_refill", [row], title="VoxPoser (offline/libero): refilled slots against batches")
 
 
 def run(options: argparse.Namespace, num_envs: int, episodes: str) -> tuple[EvalResult, float]:

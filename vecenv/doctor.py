@@ -204,8 +204,9 @@ def packages() -> tuple[Package, ...]:
     rows: dict[str, Package] = {}
     for group, extra in [("core", ""), *((e, e) for e in extras)]:
         for requirement in requirements:
-            if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
-                rows.setdefault(requirement.name, _package(requirement, group))
+            wanted = requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+            if wanted and requirement.name not in rows:  # looking up a version takes a millisecond
+                rows[requirement.name] = _package(requirement, group)
     for name in ALSO_SHOWN:
         version = installed_version(name)
         rows.setdefault(name, Package(name, "also", "", version, bool(version)))

@@ -4,7 +4,10 @@ An environment that speaks ``vecenv.contract`` and an :class:`~voxposer.language
 (:meth:`Agent.step`) every slot that has a subtask left plans it on one frozen snapshot: the composer's program asks for
 motions, the planner turns the value maps of all slots into paths in one call, and one ``env.step_waypoints`` executes
 all plans. Objects that are to be moved without a grasp are pushed, one push a round. A slot whose program fails, or for
-which there is no path, is stopped with its cause (``voxposer.slots``); the other slots continue.
+which there is no path, is stopped with its cause (``voxposer.slots``) and holds still; the other slots continue.
+
+Nothing that a slot does depends on the others: in a round it executes its own plan and no tick more, so a slot may
+begin another episode (:meth:`Agent.begin`) while the others are anywhere in theirs.
 """
 
 from __future__ import annotations
@@ -49,7 +52,7 @@ class AgentConfig:
         push: how objects are pushed.
         passes: how often the whole instruction is planned when it was executed to the end without success.
         max_misses: a plan is abandoned after this many waypoints in a row that could not be reached.
-        idle_ticks: ticks that slots without a plan wait per round.
+        idle_ticks: ticks that stopped slots wait in a round in which no slot has a plan.
     """
 
     perception: PerceptionConfig = field(default_factory=PerceptionConfig)
@@ -111,31 +114,47 @@ class Agent:
         on_planned: Callable[[PlannedMotion], None] | None = None,
     ) -> None:
         self.env, self.config, self._on_planned = env, config, on_planned
+        self._llm, self._prompts_dir = llm, prompts_dir
         self._finished, self.succeeded = np.zeros(env.num_envs, bool), np.zeros(env.num_envs, bool)
-        self.slots: list[Slot] = []
-        for instruction, snapshot in zip(instructions, env.observe_objects().snapshot, strict=True):
-            interface = Interface()
-            home = np.zeros(7) if snapshot is None else snapshot.ee_pose.copy()
-            lmps = build_lmps(interface.functions(), llm, prompts_dir)
-            self.slots.append(Slot(instruction, lmps, interface, home))
+        snapshots = env.observe_objects().snapshot
+        self.slots = [self._slot(*pair) for pair in zip(instructions, snapshots, strict=True)]
+
+    def begin(self, instructions: Sequence[str], slots: Sequence[int]) -> None:
+        """Begin other episodes in some slots, which were just reset; the others continue theirs.
+
+        Args:
+            instructions: of every slot of the batch, B strings.
+            slots: the slots that begin.
+        """
+        snapshots = self.env.observe_objects(slots=slots).snapshot
+        for i in slots:
+            _release(self.slots[i])
+            self.slots[i] = self._slot(instructions[i], snapshots[i])
+            self._finished[i] = self.succeeded[i] = False
 
     def step(self) -> Control:
-        """One round: plan a subtask in every slot that has one left, and execute the plans; or wait."""
-        snapshots = self.env.observe_objects().snapshot
+        """One round: plan a subtask in every slot that has one left, and execute the plans; stopped slots wait."""
         live = [i for i, slot in enumerate(self.slots) if not self._finished[i] and not slot.cause]
+        snapshots = self.env.observe_objects(slots=live).snapshot
         for i in live:
             self._run_programs(self.slots[i], snapshots[i])
         waypoints = self._plan(live)
         if not any(waypoints):
             return self._record(self._wait())
+        waypoints = self._with_waiting(waypoints)
         return self._record(self._execute(plans.stack(waypoints, self.config.plan)))
 
     def close(self) -> None:
         """Release snapshots and maps; nothing can be planned afterwards."""
         for slot in self.slots:
-            if isinstance(slot.phase, Moving | Pushing):
-                slot.enter(Ready())
-            slot.interface.end()
+            _release(slot)
+
+    def _slot(self, instruction: str, snapshot: ObjectsSnapshot | None) -> Slot:
+        """A slot whose episode has just begun."""
+        interface = Interface()
+        home = np.zeros(7) if snapshot is None else snapshot.ee_pose.copy()
+        lmps = build_lmps(interface.functions(), self._llm, self._prompts_dir)
+        return Slot(instruction, lmps, interface, home)
 
     # -- one slot's subtask --------------------------------------------------------------------------------------------
 
@@ -279,6 +298,18 @@ class Agent:
                 return control
             control = self.env.step_waypoints(plan, max_misses=self.config.max_misses)
 
+    def _with_waiting(self, waypoints: Sequence[list[PlannedWaypoint]]) -> list[list[PlannedWaypoint]]:
+        """Waypoints with a hold for each slot that was stopped, grip unchanged, so that its budget runs out meanwhile.
+
+        It is no longer than the longest of the plans, of which each waypoint takes a tick or more.
+        """
+        ticks = max(sum(max(waypoint.hold, 1) for waypoint in own) for own in waypoints)
+        held = np.array([0.0, 0, 0, 1, 0, 0, 0])
+        return [
+            [PlannedWaypoint(held, slot.grip.closed, ticks, -1, 1.0)] if slot.cause and not finished else own
+            for slot, own, finished in zip(self.slots, waypoints, self._finished, strict=True)
+        ]
+
     def _wait(self) -> Control:
         """Hold still with the grip unchanged."""
         actions = np.zeros((len(self.slots), self.config.idle_ticks, 7))
@@ -288,6 +319,13 @@ class Agent:
     def _record(self, control: Control) -> Control:
         self._finished, self.succeeded = control.done, control.success
         return control
+
+
+def _release(slot: Slot) -> None:
+    """Release the snapshot and the maps of a slot."""
+    if isinstance(slot.phase, Moving | Pushing):
+        slot.enter(Ready())
+    slot.interface.end()
 
 
 def _stop_with(slot: Slot, error: Exception) -> None:

@@ -145,7 +145,7 @@ class EvalConfig:
     )
     num_envs: int | None = field(
         default=None,
-        metadata=_about("Most episodes that run at once.", default="the suite's", minimum=1, resumable=True),
+        metadata=_about("Most episodes that run at once.", default="what fits into memory", minimum=1, resumable=True),
     )
     num_threads: int | None = field(
         default=None,

@@ -43,7 +43,7 @@ def make_streams(
     tasks: Sequence[int],
     episodes: Mapping[int, Sequence[int]],
     *,
-    num_envs: int | None,
+    num_envs: int,
     done: Collection[Episode] = (),
 ) -> list[Stream]:
     """What runs the episodes of tasks but those in ``done``; batches, if the policy cannot begin single slots.
@@ -53,13 +53,12 @@ def make_streams(
         suite: the suite.
         tasks: task indices.
         episodes: episode indices by task.
-        num_envs: most episodes that run at once, None for the suite's number.
+        num_envs: most episodes that run at once.
         done: episodes to leave out.
     """
-    most = suite.max_slots if num_envs is None else num_envs
     if isinstance(policy, Refillable):
-        return streams(suite, tasks, episodes, num_envs=most, done=done)
-    return [Stream.of(b) for b in plan(suite, tasks, episodes, num_envs=most, done=done)]
+        return streams(suite, tasks, episodes, num_envs=num_envs, done=done)
+    return [Stream.of(b) for b in plan(suite, tasks, episodes, num_envs=num_envs, done=done)]
 
 
 class EpisodeLoop:
@@ -202,10 +201,8 @@ class EpisodeLoop:
         ended = 0
 
         def refill(done: np.ndarray) -> np.ndarray:
-            nonlocal ended
             rows = running.slots_to_refill(done, self._refill_share)
             if len(rows):
-                ended += int(env.evaluate().num_steps[done].sum())
                 began = clocks.now()
                 running.refill(rows, done)
                 assert isinstance(self._policy, Refillable)
@@ -220,6 +217,7 @@ class EpisodeLoop:
             clocks.tick(control)
             if finished.any():
                 metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
+                ended += int(metrics.num_steps[finished].sum())
                 records = {slot: self._record(number, running, slot, metrics, control, clocks) for slot in slots}
                 for recorder in self._recorders:
                     recorder.finish(env, records)
@@ -227,7 +225,7 @@ class EpisodeLoop:
                 self._verdicts += len(slots)
                 self._tell_policy(running, slots)
             progress.steps, progress.seconds = (
-                before[0] + ended + int(control.step_index.sum()),
+                before[0] + ended + int(control.step_index[~control.done].sum()),
                 before[1] + clocks.now(),
             )
             progress.report(number)
@@ -331,7 +329,12 @@ class _Running:
         return np.array(rows if enough else [], int)
 
     def refill(self, rows: np.ndarray, done: np.ndarray) -> None:
-        """Place the next episode of their scene in slots, and reset them; other slots that are done stay so."""
+        """Place the next episode of their scene in finished slots, and reset them.
+
+        Args:
+            rows: the slots.
+            done: every slot that has finished, bool [B]; those without a next episode stay finished.
+        """
         for row in rows.tolist():
             self.slots[row] = self._waiting[self._suite.scenes[self.slots[row].task]].popleft()
         chosen = [self.slots[row] for row in rows.tolist()]

@@ -24,6 +24,7 @@ from vecenv_eval.engine import EngineError, make_engine
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, shard
 from vecenv_eval.loop import make_streams
+from vecenv_eval.memory import SlotChoice, choose_slots
 from vecenv_eval.policies import Closing, Policy, Seeing, check_policy, make_policy, raised
 from vecenv_eval.provenance import run_conditions
 from vecenv_eval.results import POLICY_NAME, EvalResult, Progress, open_or_begin, write_results
@@ -108,14 +109,17 @@ class Evaluation:
         """Every episode asked for, task by task."""
         return tuple(Episode(self.suite.name, task, e) for task in self.tasks for e in self.episodes[task])
 
+    @cached_property
+    def slots(self) -> SlotChoice:
+        """How many slots run at once; chosen once, before environments take memory."""
+        return choose_slots(self.config, self.suite, self.tasks, self.simulator)
+
     def streams(self, done: Collection[Episode] = ()) -> list[Stream]:
         """What runs the planned episodes but those in ``done``.
 
         Nothing follows in a slot if the policy cannot begin single slots.
         """
-        return make_streams(
-            self.policy, self.suite, self.tasks, self.episodes, num_envs=self.config.num_envs, done=done
-        )
+        return make_streams(self.policy, self.suite, self.tasks, self.episodes, num_envs=self.slots.num_envs, done=done)
 
     def run(self, store: ResultStore, on_progress: Callable[[Progress], None] = lambda progress: None) -> EvalResult:
         """Run what the store does not have yet.
@@ -155,7 +159,11 @@ class Evaluation:
         content = store.config()
         runs = content.get("runs", [])
         name = {POLICY_NAME: self.policy.name} if self._engine.in_process else {}
-        store.write_config({**content, **name, "runs": [*runs, {**run_conditions(), "engine": self.config.engine}]})
+        run = {**run_conditions(), "engine": self.config.engine}
+        if self._engine.in_process:
+            _log.info("at most %d slots: %s", self.slots.num_envs, self.slots.reason)
+            run |= {"num_envs": self.slots.num_envs, "num_envs_reason": self.slots.reason}
+        store.write_config({**content, **name, "runs": [*runs, run]})
         try:
             outcome = self._engine.run(self, store, len(runs), on_progress)
         except (ConfigError, EngineError):

@@ -249,7 +249,18 @@ def test_the_folder_says_how_it_came_about(folder: Path) -> None:
     conditions = content["runs"][0]
     assert {"python", "vecenv", "mujoco", "jax", "numpy"} <= set(conditions["versions"])
     assert conditions["machine"]["cores"] >= 1
-    assert set(conditions) == {"started", "arguments", "commit", "versions", "machine", "engine"}
+    assert set(conditions) == {
+        "started",
+        "arguments",
+        "commit",
+        "versions",
+        "machine",
+        "engine",
+        "num_envs",
+        "num_envs_reason",
+    }
+    assert conditions["num_envs"] == 256
+    assert "GiB of memory available" in conditions["num_envs_reason"]
     assert "| 0 | do thing 0 | 5/5 | 100.0% |" in (folder / "report.md").read_text()
 
 

@@ -94,6 +94,33 @@ def test_a_slot_takes_the_next_episode_of_its_scene_at_once(folder: Path, monkey
     assert [record.num_steps for record in result.records] == [2, 3, 4, 5, 6]
 
 
+def test_slots_without_another_episode_stay_where_they_are_while_others_are_refilled(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reset, tick, moved = FakeEnv.reset, FakeEnv._tick, []
+
+    def restarting(self: FakeEnv) -> ResetInfo:
+        """As the contract says: every finished slot begins its episode again."""
+        self.ticks[self.done] = 0
+        self.terminated[:], self.truncated[:] = False, False
+        return reset(self)
+
+    def counting(self: FakeEnv) -> None:
+        moved.append(int((~self.done).sum()))
+        tick(self)
+
+    monkeypatch.setattr(FakeEnv, "reset", restarting)
+    monkeypatch.setattr(FakeEnv, "_tick", counting)
+    steps: list[int] = []
+    config = EvalConfig(suite=SUITE, policy="zero", num_envs=4)
+    # Scene kitchen (tasks 0 and 2) has run out long before scene study, whose episodes take their whole budget.
+    result = evaluate(
+        config, begin(config, folder), simulator=FakeWorld().simulator, on_progress=lambda p: steps.append(p.steps)
+    )
+    assert sum(moved) == sum(record.num_steps for record in result.records) == steps[-1]
+    assert steps == sorted(steps)
+
+
 @pytest.mark.parametrize("num_envs", [1, 2, 3, 7, 10, 100])
 def test_rows_are_the_same_at_any_number_of_slots(folder: Path, num_envs: int) -> None:
     whole = run(folder, FakeWorld(faults={(2, 1): "broken"}), policy="random")

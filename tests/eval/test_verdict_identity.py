@@ -25,6 +25,7 @@ from vecenv_eval.episodes import Stream
 from vecenv_eval.merge import merge
 from vecenv_eval.policies.pick_place.policy import PickPlacePolicy
 from vecenv_eval.policies.random import RandomPolicy
+from vecenv_eval.policies.voxposer import VoxPoserPolicy
 from vecenv_eval.results import Progress, begin, resume
 from vecenv_eval.runner import evaluate
 from vecenv_eval.store import EPISODES, ResultStore
@@ -161,7 +162,7 @@ def test_rows_do_not_depend_on_how_an_evaluation_was_arranged(
     whole = EvalConfig(suite="libero_goal", policy=policy, tasks="1,3,7", episodes="3", max_steps=STEPS[policy])
     shards = range(1, arrangement.shards + 1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "streams", shuffled(random.Random(arrangement.order)))
+        patch.setattr(runner, "make_streams", shuffled(random.Random(arrangement.order)))
         for part in shards:
             arranged = replace(
                 whole,
@@ -192,7 +193,7 @@ def evaluate_with_a_stop(config: EvalConfig, folder: Path, stop_after: int | Non
 
 def shuffled(chance: random.Random) -> Callable[..., list[Stream]]:
     """Streams whose slots and refills come in another order within each scene."""
-    plan = runner.streams
+    plan = runner.make_streams
 
     def mixed(episodes: Sequence[Any]) -> tuple[Any, ...]:
         return tuple(chance.sample(list(episodes), len(episodes)))
@@ -204,3 +205,39 @@ def shuffled(chance: random.Random) -> Callable[..., list[Stream]]:
         ]
 
     return streams
+
+
+class Planned(VoxPoserPolicy):
+    """VoxPoser, with a hash of the state that each episode ended in in its record."""
+
+    env: BatchEnv
+
+    def reset(self, env: BatchEnv, info: ResetInfo) -> None:
+        self.env = env
+        super().reset(env, info)
+
+    def extras(self, slot: int) -> dict[str, Any]:
+        state, said = self.env.state(), super().extras(slot)
+        ended = hashlib.sha256(state.qpos[slot].tobytes() + state.qvel[slot].tobytes()).hexdigest()
+        return {"ended": ended, **{name: said[name] for name in ("subtasks", "waypoints", "cause")}}
+
+
+class PlannedInBatches:
+    """The same without single slots: a batch waits for its slowest episode."""
+
+    name = "planned"
+
+    def __init__(self) -> None:
+        self._policy = Planned()
+        self.name = self._policy.name
+        self.reset, self.act, self.extras = self._policy.reset, self._policy.act, self._policy.extras
+
+
+def test_rows_of_voxposer_are_those_of_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"suite": "libero_object", "tasks": "0,3", "episodes": "3", "max_steps": 130}
+    monkeypatch.setattr(policies, "_load", lambda name: PlannedInBatches)
+    batches = run(tmp_path / "batches", "voxposer", num_envs=6, **settings)
+    monkeypatch.setattr(policies, "_load", lambda name: Planned)
+    refilled = run(tmp_path / "refilled", "voxposer", num_envs=4, **settings)
+    assert refilled == batches
+    assert len(set(refilled)) == 6

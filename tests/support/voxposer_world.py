@@ -90,10 +90,9 @@ class Obedient:
         for slot in range(self.num_envs):
             for t in np.flatnonzero(plan.valid[slot]):
                 gap = 0.0 if plan.grip[slot, t] else 0.04
-                self.snapshots[slot] = replace(
-                    self.snapshots[slot], ee_pose=plan.poses[slot, t].copy(), gripper=np.array([gap, -gap])
-                )
-        spent = plan.valid.astype(int)
+                here = self.snapshots[slot].ee_pose if plan.hold[slot, t] else plan.poses[slot, t].copy()
+                self.snapshots[slot] = replace(self.snapshots[slot], ee_pose=here, gripper=np.array([gap, -gap]))
+        spent = np.where(plan.valid, np.maximum(plan.hold, 1), 0)
         self.ticks += spent.sum(axis=1)
         return PlanControl(**self._flags(), converged=plan.valid.copy(), waypoint_ticks=spent, error=("",))
 

@@ -271,7 +271,28 @@ def test_a_slot_whose_program_fails_does_not_stop_the_others() -> None:
     assert "crash" in acting.slots[0].cause
     assert "nothing_like_this" in acting.slots[0].cause
     assert not acting.slots[1].cause
-    assert env.plans[0].valid.any(axis=1).tolist() == [False, True]
+    (plan,) = env.plans
+    # The failed one holds still for as long as the other surely needs.
+    assert plan.hold[0][plan.valid[0]].tolist() == [env.ticks[1]]
+    assert not plan.grip[0][plan.valid[0]].any()
+    assert acting.slots[0].counts.waypoints == 0
+    np.testing.assert_array_equal(env.snapshots[0].ee_pose, HOME)
+    assert env.snapshots[1].ee_pose[2] > HOME[2]
+
+
+def test_a_slot_begins_another_episode_while_the_others_are_between_subtasks() -> None:
+    env = Obedient(snapshot(CUBE), snapshot(CUBE))
+    acting, _ = agent(env, ("break", "lift"))
+    acting.step()
+    before = acting.slots[1]
+    env.snapshots[0] = snapshot({"plate_1": CUBE["cube_1"]})  # as a reset leaves the slot
+    acting.begin(("lift", "lift"), [0])
+    assert acting.slots[1] is before
+    assert before.progress.begun == 1
+    acting.step()
+    assert [slot.progress.begun for slot in acting.slots] == [1, 2]
+    assert not any(slot.cause for slot in acting.slots)
+    assert "plate_1" in acting.slots[0].interface.perception.snapshot.objects
 
 
 def test_an_unsolved_instruction_is_planned_again_up_to_the_pass_limit() -> None:

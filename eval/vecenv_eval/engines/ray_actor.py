@@ -24,6 +24,7 @@ import vecenv
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.episodes import Episode, Suite
 from vecenv_eval.loop import EpisodeLoop, make_streams
+from vecenv_eval.memory import choose_slots
 from vecenv_eval.policies import Closing, Policy, make_policy
 from vecenv_eval.results import Progress
 from vecenv_eval.simulator import Simulator
@@ -212,8 +213,9 @@ class EpisodeActor:
         by_task: dict[int, list[int]] = {}
         for episode in episodes:
             by_task.setdefault(episode.task, []).append(episode.episode)
-        suite, most = self._given.suite, self._given.config.num_envs
+        given, suite = self._given, self._given.suite
         try:
+            most = choose_slots(given.config, suite, tuple(by_task), given.simulator).num_envs
             for stream in make_streams(self._policy, suite, list(by_task), by_task, num_envs=most):
                 self._loop.run_stream(number, stream)
         except _Stopped:

@@ -1,13 +1,16 @@
 """``voxposer``: the language-driven planner as a policy of the harness.
 
 It follows the instruction of each slot with ``voxposer.agent`` and reports, an episode: subtasks, waypoints, questions
-to the language model and their cost, and why a failed one failed. The model is ``offline/libero`` unless another is
-named: a rule-based writer of programs, no language model at all. The policy's name says which it was.
+to the language model and their cost, and why a failed one failed. A slot whose episode has ended begins the next one in
+the agent's next round, while the others are between subtasks of theirs. The model is ``offline/libero`` unless another
+is named: a rule-based writer of programs, no language model at all. The policy's name says which it was.
 """
 
 from __future__ import annotations
 
 from typing import Any
+
+import numpy as np
 
 from vecenv.contract import BatchEnv, Control, ResetInfo
 from voxposer.agent import Agent, AgentConfig
@@ -49,6 +52,12 @@ class VoxPoserPolicy:
             self.agent.close()
         seen, config = hands(env, info.suite, self.config)
         self.agent = Agent(seen, info.instruction, self._llm, config, self._prompts_dir)
+
+    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
+        """Begin other episodes in some slots while the others continue theirs."""
+        del env
+        assert self.agent is not None, "call reset() first"
+        self.agent.begin(info.instruction, slots.tolist())
 
     def act(self, env: BatchEnv) -> Control:
         """Plan and follow the next subtask of every slot."""
