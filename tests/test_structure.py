@@ -16,6 +16,7 @@ from vecenv.errors import VecenvError
 # Exceptions that do not derive from VecenvError, with the reason.
 EXCEPTIONS = {
     "_ContextLost": "raised and caught in vecenv.libero.render.gl, which then makes a new GL context",
+    "_Stopped": "raised and caught in vecenv_eval.engines.ray_actor, where it ends the episode loop",
     "ConnectionLost": "raised and caught in vecenv_eval.clients.zmq, which retries and then raises PolicyServerError",
 }
 

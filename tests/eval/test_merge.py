@@ -366,7 +366,7 @@ def film(root: Path, outcomes: Sequence[tuple[int, Record]], begun: int = 0, env
         with watching(env, [writer]):
             for _ in range(ticks):
                 env.tick(1)
-        writer.finish(1, outcome)
+        writer.finish(env, {1: outcome})
     writer.close()
 
 

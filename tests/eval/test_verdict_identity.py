@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from vecenv_eval import policies, runner
+from vecenv_eval import loop, policies
 from vecenv_eval.config import STORE_CHOICES, EvalConfig
 from vecenv_eval.episodes import Stream
 from vecenv_eval.merge import merge
@@ -162,7 +162,7 @@ def test_rows_do_not_depend_on_how_an_evaluation_was_arranged(
     whole = EvalConfig(suite="libero_goal", policy=policy, tasks="1,3,7", episodes="3", max_steps=STEPS[policy])
     shards = range(1, arrangement.shards + 1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "make_streams", shuffled(random.Random(arrangement.order)))
+        patch.setattr(loop, "streams", shuffled(random.Random(arrangement.order)))
         for part in shards:
             arranged = replace(
                 whole,
@@ -193,7 +193,7 @@ def evaluate_with_a_stop(config: EvalConfig, folder: Path, stop_after: int | Non
 
 def shuffled(chance: random.Random) -> Callable[..., list[Stream]]:
     """Streams whose slots and refills come in another order within each scene."""
-    plan = runner.make_streams
+    plan = loop.streams
 
     def mixed(episodes: Sequence[Any]) -> tuple[Any, ...]:
         return tuple(chance.sample(list(episodes), len(episodes)))
