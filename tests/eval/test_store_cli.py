@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,6 @@ from typer.testing import CliRunner, Result
 from vecenv_eval import campaign, runner
 from vecenv_eval.merge import folders
 from vecenv_eval.store import ResultStore, jsonl, sqlite
-from vecenv_eval.store.lock import writing
 
 from vecenv.cli import build_app
 
@@ -36,9 +37,9 @@ def world(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeWorld:
     return world
 
 
-def one_line(result: Result) -> str:
-    """The only line that a refused command prints."""
-    assert result.exit_code == 2, result.output
+def one_line(result: Result, status: int = 2) -> str:
+    """The only line that a command prints which is refused, or cannot go on."""
+    assert result.exit_code == status, result.output
     assert len(result.stderr.splitlines()) == 1
     return result.stderr
 
@@ -88,20 +89,27 @@ def test_a_folder_of_something_else_is_refused() -> None:
     assert "campaign is already there and holds several suites" in one_line(evaluate("--out", "campaign"))
 
 
+# Holds the folder until its input ends.
+HOLDER = """
+import sys
+from pathlib import Path
+from vecenv_eval.store.lock import writing
+with writing(Path("here")):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
 def test_a_folder_that_another_process_writes_to_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert evaluate("--out", "here").exit_code == 0
-    ready, release = os.pipe(), os.pipe()
-    if not (child := os.fork()):
-        with writing(Path("here")):
-            os.write(ready[1], b"x")
-            os.read(release[0], 1)
-        os._exit(0)
-    os.read(ready[0], 1)
-    try:
-        assert f"error: here is in use: process {child} on" in one_line(evaluate("--out", "here"))
-    finally:
-        os.write(release[1], b"x")
-        os.waitpid(child, 0)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command, pipe = [sys.executable, "-c", HOLDER], subprocess.PIPE
+    with subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe) as holder:
+        assert holder.stdout is not None
+        assert holder.stdin is not None
+        assert holder.stdout.readline() == b"held\n"
+        assert f"error: here is in use: process {holder.pid} on" in one_line(evaluate("--out", "here"))
+        holder.stdin.close()
     assert evaluate("--out", "here").exit_code == 0
 
 
@@ -117,7 +125,7 @@ def test_a_full_disk_ends_the_run_in_one_sentence_and_costs_nothing(monkeypatch:
     with monkeypatch.context() as patch:
         patch.setattr(jsonl, "append_text", full)
         assert "error: here/episodes.jsonl cannot be written: No space left" in one_line(
-            evaluate("--out", "here", "--num-envs", "2")
+            evaluate("--out", "here", "--num-envs", "2"), status=1
         )
     done = ResultStore(Path("here")).done()
     assert len(done) >= 3
@@ -136,14 +144,16 @@ def test_the_store_is_kept_when_a_folder_is_resumed(world: FakeWorld) -> None:
     assert "store=" in one_line(evaluate("--store", "papyrus"))
 
 
-def test_a_database_without_its_log_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "write-ahead log is off" not in evaluate("--store", "sqlite", "--out", "local").stdout
+def test_a_database_without_its_log_is_announced(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert evaluate("--store", "sqlite", "--out", "local").exit_code == 0
+    assert "write-ahead log is off" not in caplog.text
     stored = json.loads(Path("local/summary.json").read_text())["conditions"]["store"]
     assert stored == "sqlite, write-ahead log"
     monkeypatch.setattr(sqlite, "file_system", lambda folder: "nfs4")
-    done = evaluate("--store", "sqlite", "--out", "shared")
-    assert done.exit_code == 0
-    assert "the write-ahead log is off" in done.stdout.replace("SQLite's", "the")
+    assert evaluate("--store", "sqlite", "--out", "shared").exit_code == 0
+    assert "write-ahead log is off" in caplog.text
     assert json.loads(Path("shared/config.json").read_text())["conditions"]["store"].endswith("(file system nfs4)")
     assert "store sqlite, no write-ahead log (file system nfs4)" in Path("shared/report.md").read_text()
 

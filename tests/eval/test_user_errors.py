@@ -350,7 +350,7 @@ def test_a_file_that_cannot_grow_during_the_run_costs_no_verdict(tmp_path: Path)
     done = in_a_process(6000, *arguments)
     assert (done.returncode, done.stderr) == (
         1,
-        f"error: the results in {out} cannot be written: File too large. What was computed is kept; to go on: "
+        f"error: {out / 'episodes.jsonl'} cannot be written: File too large. What was computed is kept; to go on: "
         f"vecenv eval --resume {out}\n",
     )
     kept = store.ResultStore(out).done()

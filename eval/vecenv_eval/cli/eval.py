@@ -9,7 +9,6 @@ Ctrl-C (what was computed is kept, and the command that resumes it is printed).
 from __future__ import annotations
 
 import logging
-import sqlite3
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -219,18 +218,19 @@ class _RunError(VecenvError, RuntimeError):
 def _disk_errors(folder: Path) -> Iterator[None]:
     """Results that cannot be written, or read: whatever else raises such an error has been dealt with below."""
     from vecenv_eval.results import CAMPAIGN
-    from vecenv_eval.store import CONFIG, StoreError
+    from vecenv_eval.store import CONFIG, StoreWriteError
 
     try:
         yield
-    except (OSError, StoreError) as error:
-        cause = error.__cause__ if isinstance(error, StoreError) else error
-        if not isinstance(cause, OSError | sqlite3.OperationalError):
-            raise
+    except (OSError, StoreWriteError) as error:
         there = any((folder / name).is_file() for name in (CONFIG, CAMPAIGN))
         again = f" What was computed is kept; to go on: vecenv eval --resume {folder}" if there else ""
-        what = cause.strerror if isinstance(cause, OSError) and cause.strerror else str(cause)
-        raise _RunError(f"the results in {folder} cannot be written: {what}.{again}") from error
+        what = (
+            f"the results in {folder} cannot be written: {error.strerror or error}"
+            if isinstance(error, OSError)
+            else error
+        )
+        raise _RunError(f"{what}.{again}") from error
 
 
 @contextmanager

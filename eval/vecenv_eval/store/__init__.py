@@ -6,7 +6,7 @@ database (``rows``, ``jsonl``, ``sqlite``); whoever reads a folder does not need
 
 from vecenv_eval.store.folder import CONFIG, DEMOS, ERRORS, REPORT, RESULTS, SUMMARY, ResultStore, default_folder
 from vecenv_eval.store.jsonl import EPISODES
-from vecenv_eval.store.record import CIRCUMSTANCES, Record, StoreError
+from vecenv_eval.store.record import CIRCUMSTANCES, Record, StoreError, StoreWriteError
 from vecenv_eval.store.rows import STORES
 from vecenv_eval.store.sqlite import DATABASE
 
@@ -24,5 +24,6 @@ __all__ = [
     "Record",
     "ResultStore",
     "StoreError",
+    "StoreWriteError",
     "default_folder",
 ]

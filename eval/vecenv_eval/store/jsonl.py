@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store.files import append_text
-from vecenv_eval.store.record import Record, StoreError, from_plain, to_plain
+from vecenv_eval.store.record import Record, StoreError, StoreWriteError, from_plain, to_plain
 
 EPISODES = "episodes.jsonl"
 
@@ -44,7 +44,7 @@ class JsonlRows:
             self._whole = False  # unless all of it is written
             append_text(self.path, text)
         except OSError as error:
-            raise StoreError(f"{self.path} cannot be written: {error.strerror}") from None
+            raise StoreWriteError(f"{self.path} cannot be written: {error.strerror}") from None
         self._whole = True
 
     def read(self) -> dict[Episode, Record]:

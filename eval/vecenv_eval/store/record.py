@@ -18,6 +18,10 @@ class StoreError(InvalidFile):
     """A results folder cannot be made, read or resumed; the message names the file."""
 
 
+class StoreWriteError(StoreError):
+    """Rows cannot be written, to a full disk for example; what was written before is kept."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Record:
     """One row of a results folder: how one episode went.

@@ -17,7 +17,7 @@ from typing import Any
 
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store.filesystems import file_system, is_local
-from vecenv_eval.store.record import Record, StoreError, from_plain, to_plain
+from vecenv_eval.store.record import Record, StoreError, StoreWriteError, from_plain, to_plain
 
 DATABASE = "episodes.sqlite"
 # Version of the table, in the database's ``user_version``.
@@ -209,7 +209,8 @@ class SqliteRows:
         try:
             yield
         except (sqlite3.Error, UnicodeDecodeError) as error:
-            raise StoreError(f"{self.path} cannot be {done}: {error}") from None
+            kind = StoreWriteError if done == "written" else StoreError
+            raise kind(f"{self.path} cannot be {done}: {error}") from None
 
 
 def _set_journal(connection: sqlite3.Connection, mode: str) -> str:

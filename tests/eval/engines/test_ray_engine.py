@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from support.fakes import SUITE, FakeEnv, FakeWorld
+from support.ray_cluster import ray_cluster
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.engine import EngineError
 from vecenv_eval.episodes import Episode
@@ -19,11 +20,10 @@ from vecenv_eval.simulator import Simulator
 from vecenv_eval.store import EPISODES
 
 ray = pytest.importorskip("ray")
-cluster_utils = pytest.importorskip("ray.cluster_utils")
+pytest.importorskip("ray.cluster_utils")
 
 from vecenv_eval.engines.ray_options import RayOptions, resources, room  # noqa: E402
 
-STORE_BYTES = 80 * 10**6
 SLOW = "support.slow_policy:SlowPolicy"
 
 
@@ -66,16 +66,10 @@ def local(folder: Path, world: FakeWorld, **settings: Any) -> EvalResult:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """A Ray instance with two CPUs, to which this process is connected."""
-    ray.init(
-        address="local",
-        num_cpus=2,
-        object_store_memory=STORE_BYTES,
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level="ERROR",
-    )
-    yield ray
-    ray.shutdown()
+    with ray_cluster(2) as nodes:
+        ray.init(address=nodes.address, log_to_driver=False, logging_level="ERROR")
+        yield ray
+        ray.shutdown()
 
 
 def on_ray(folder: Path, world: FakeWorld, arguments: Mapping[str, Any] | None = None, **settings: Any) -> EvalResult:

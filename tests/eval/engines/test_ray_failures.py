@@ -14,15 +14,15 @@ from typing import Any
 
 import pytest
 from support.fakes import SUITE, FakeWorld
+from support.ray_cluster import ClusterProcess, ray_cluster
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.results import EvalResult, Progress, resume
 from vecenv_eval.runner import evaluate
 from vecenv_eval.store import EPISODES
 
 ray = pytest.importorskip("ray")
-cluster_utils = pytest.importorskip("ray.cluster_utils")
+pytest.importorskip("ray.cluster_utils")
 
-STORE_BYTES = 80 * 10**6
 SLOW = "support.slow_policy:SlowPolicy"
 
 
@@ -40,34 +40,30 @@ def local(folder: Path) -> EvalResult:
 
 
 @pytest.fixture
-def nodes() -> Iterator[Any]:
+def nodes() -> Iterator[ClusterProcess]:
     """Two nodes with a CPU each, the second of which can be killed."""
     if ray.is_initialized():
         ray.shutdown()
-    cluster = cluster_utils.Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": STORE_BYTES}
-    )
-    yield cluster, cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
-    cluster.shutdown()
+    with ray_cluster(1, 1) as cluster:
+        yield cluster
 
 
 class Kills:
     """Kills a node as soon as some episodes are done; may be called as ``on_progress``."""
 
-    def __init__(self, cluster: Any, node: Any, done: int) -> None:
-        self._cluster, self._node, self._done = cluster, node, done
+    def __init__(self, cluster: ClusterProcess, done: int) -> None:
+        self._cluster, self._done = cluster, done
         self.killed = False
 
     def __call__(self, progress: Progress) -> None:
         if progress.done >= self._done and not self.killed:
             self.killed = True
-            self._cluster.remove_node(self._node, allow_graceful=False)
+            self._cluster.kill_last_node()
 
 
-def test_a_node_that_is_killed_costs_no_verdict(tmp_path: Path, nodes: Any) -> None:
-    cluster, doomed = nodes
-    kill = Kills(cluster, doomed, 4)
-    arguments = {"address": cluster.address, "unit": 3}
+def test_a_node_that_is_killed_costs_no_verdict(tmp_path: Path, nodes: ClusterProcess) -> None:
+    kill = Kills(nodes, 4)
+    arguments = {"address": nodes.address, "unit": 3}
     config = EvalConfig(suite=SUITE, policy=SLOW, num_envs=2, engine="ray", engine_args=arguments)
     result = evaluate(config, tmp_path / "run", simulator=FakeWorld().simulator, on_progress=kill)
     assert kill.killed
@@ -78,9 +74,8 @@ def test_a_node_that_is_killed_costs_no_verdict(tmp_path: Path, nodes: Any) -> N
 
 
 @pytest.mark.heavy
-def test_trajectories_of_libero_are_the_same_with_a_node_killed(tmp_path: Path, nodes: Any) -> None:
-    cluster, doomed = nodes
-    kill = Kills(cluster, doomed, 2)
+def test_trajectories_of_libero_are_the_same_with_a_node_killed(tmp_path: Path, nodes: ClusterProcess) -> None:
+    kill = Kills(nodes, 2)
     config = EvalConfig(
         suite="libero_goal",
         policy="support.hashing_policy:HashingPolicy",
@@ -88,7 +83,7 @@ def test_trajectories_of_libero_are_the_same_with_a_node_killed(tmp_path: Path, 
         episodes="4",
         max_steps=40,
         engine="ray",
-        engine_args={"address": cluster.address, "unit": 2},
+        engine_args={"address": nodes.address, "unit": 2},
     )
     result = evaluate(config, tmp_path / "run", on_progress=kill)
     assert kill.killed
