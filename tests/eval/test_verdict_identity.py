@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.hashing_policy import Hashing
 from vecenv_eval import loop, policies
 from vecenv_eval.config import STORE_CHOICES, EvalConfig
 from vecenv_eval.episodes import Stream
@@ -35,37 +35,10 @@ from vecenv.contract import BatchEnv, ResetInfo
 POLICIES = {"random": RandomPolicy, "pick_place": PickPlacePolicy}
 
 
-class Hashing:
-    """Another policy, with a hash of the states that each episode went through in its record."""
-
-    def __init__(self, name: str) -> None:
-        self.name, self._policy = name, POLICIES[name]()
-        self._hashes: list[Any] = []
-
-    def reset(self, env: BatchEnv, info: ResetInfo) -> None:
-        self._hashes = [hashlib.sha256() for _ in range(env.num_envs)]
-        self._policy.reset(env, info)
-
-    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
-        for slot in slots.tolist():
-            self._hashes[slot] = hashlib.sha256()
-        self._policy.reset_slots(env, info, slots)
-
-    def act(self, env: BatchEnv) -> np.ndarray:
-        state = env.state()
-        for slot in np.flatnonzero(~env.done).tolist():
-            self._hashes[slot].update(state.qpos[slot, : state.nq[slot]].tobytes())
-            self._hashes[slot].update(state.qvel[slot, : state.nv[slot]].tobytes())
-        return self._policy.act(env)
-
-    def extras(self, slot: int) -> dict[str, str]:
-        return {"states": self._hashes[slot].hexdigest()}
-
-
 @pytest.fixture
 def hashed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Built-in policies report what they went through."""
-    monkeypatch.setattr(policies, "_load", lambda name: lambda: Hashing(name))
+    monkeypatch.setattr(policies, "_load", lambda name: lambda: Hashing(POLICIES[name](), name))
 
 
 def rows(folder: Path) -> list[str]:
@@ -143,7 +116,7 @@ ARRANGEMENTS = st.builds(
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     """Rows of a run in one go, by policy."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(policies, "_load", lambda name: lambda: Hashing(name))
+        patch.setattr(policies, "_load", lambda name: lambda: Hashing(POLICIES[name](), name))
         folder = tmp_path_factory.mktemp("undisturbed")
         return {name: run(folder / name, name, max_steps=STEPS[name]) for name in POLICIES}
 

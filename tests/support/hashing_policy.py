@@ -1,23 +1,26 @@
-"""The random policy, reporting a hash of every state that an episode went through: trajectories are told apart."""
+"""Policies that report a hash of every state that an episode went through: trajectories are told apart."""
 
 from __future__ import annotations
 
 import hashlib
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from vecenv_eval.policies import Policy, Refillable
 from vecenv_eval.policies.random import RandomPolicy
 
-from vecenv.contract import BatchEnv, ResetInfo
+from vecenv.contract import BatchEnv, Control, ResetInfo
 
 
-class HashingPolicy:
-    """Acts at random; ``extras`` has the hash of all positions and velocities before each action."""
+class Whole(Policy, Refillable, Protocol):
+    """A policy that is refilled."""
 
-    name = "hashing"
 
-    def __init__(self, seed: int = 0) -> None:
-        self._policy = RandomPolicy(seed=seed)
+class Hashing:
+    """Acts as another policy; ``extras`` has the hash of all positions and velocities before each action."""
+
+    def __init__(self, policy: Whole, name: str) -> None:
+        self.name, self._policy = name, policy
         self._hashes: list[Any] = []
 
     def reset(self, env: BatchEnv, info: ResetInfo) -> None:
@@ -29,7 +32,7 @@ class HashingPolicy:
             self._hashes[slot] = hashlib.sha256()
         self._policy.reset_slots(env, info, slots)
 
-    def act(self, env: BatchEnv) -> np.ndarray:
+    def act(self, env: BatchEnv) -> np.ndarray | Control:
         state = env.state()
         for slot in np.flatnonzero(~env.done).tolist():
             self._hashes[slot].update(state.qpos[slot, : state.nq[slot]].tobytes())
@@ -38,3 +41,10 @@ class HashingPolicy:
 
     def extras(self, slot: int) -> dict[str, str]:
         return {"states": self._hashes[slot].hexdigest()}
+
+
+class HashingPolicy(Hashing):
+    """Acts at random."""
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__(RandomPolicy(seed=seed), "hashing")

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 STORE_BYTES = 80 * 10**6
 
@@ -54,7 +55,7 @@ def main(cpus: Sequence[int]) -> None:
     """Start the nodes, print the address, and obey until the input ends."""
     from ray.cluster_utils import Cluster
 
-    nodes = [{"num_cpus": count, "object_store_memory": STORE_BYTES} for count in cpus]
+    nodes: list[dict[str, Any]] = [{"num_cpus": count, "object_store_memory": STORE_BYTES} for count in cpus]
     cluster = Cluster(initialize_head=True, head_node_args={**nodes[0], "include_dashboard": False})
     others = [cluster.add_node(**node) for node in nodes[1:]]
     print(cluster.address, flush=True)
