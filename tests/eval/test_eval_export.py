@@ -51,7 +51,7 @@ def read(path: Path, kind: str) -> list[dict[str, Any]]:
         options = pytest.importorskip("pyarrow.csv").ParseOptions(newlines_in_values=True)
         rows = sys.modules["pyarrow.csv"].read_csv(path, parse_options=options).to_pylist()
         rows = [{n: "" if v is None and "TEXT" in TABLE[n] else v for n, v in row.items()} for row in rows]
-    return [{**row, **{name: json.loads(row[name]) for name in ("extras", "stand_ins", "parts")}} for row in rows]
+    return [{**row, **{name: json.loads(str(row[name])) for name in ("extras", "stand_ins", "parts")}} for row in rows]
 
 
 @pytest.mark.parametrize("kind", FORMATS)
