@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -27,6 +28,21 @@ class SlowPolicy:
     def act(self, env: BatchEnv) -> np.ndarray:
         time.sleep(self._seconds)
         return np.zeros((env.num_envs, 7))
+
+
+class MeetingPolicy(SlowPolicy):
+    """Acts once as many processes as ``processes`` have got so far; each leaves a file in ``folder``."""
+
+    def __init__(self, folder: str, processes: int) -> None:
+        super().__init__()
+        self._folder, self._processes = Path(folder), processes
+
+    def act(self, env: BatchEnv) -> np.ndarray:
+        (self._folder / str(os.getpid())).touch()
+        until = time.monotonic() + 60
+        while len(list(self._folder.iterdir())) < self._processes and time.monotonic() < until:
+            time.sleep(0.05)
+        return super().act(env)
 
 
 class FailingPolicy(SlowPolicy):

@@ -64,7 +64,16 @@ class Kills:
 def test_a_node_that_is_killed_costs_no_verdict(tmp_path: Path, nodes: ClusterProcess) -> None:
     kill = Kills(nodes, 4)
     arguments = {"address": nodes.address, "unit": 3}
-    config = EvalConfig(suite=SUITE, policy=SLOW, num_envs=2, engine="ray", engine_args=arguments)
+    meeting = tmp_path / "meeting"
+    meeting.mkdir()
+    config = EvalConfig(
+        suite=SUITE,
+        policy="support.slow_policy:MeetingPolicy",  # so that both nodes have begun
+        policy_args={"folder": str(meeting), "processes": 2},
+        num_envs=2,
+        engine="ray",
+        engine_args=arguments,
+    )
     result = evaluate(config, tmp_path / "run", simulator=FakeWorld().simulator, on_progress=kill)
     assert kill.killed
     assert "was lost with" in (result.folder / "errors.log").read_text()

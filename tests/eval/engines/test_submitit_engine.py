@@ -121,6 +121,7 @@ def test_slurm_gets_its_parameters_with_and_without_prefix() -> None:
     }
 
 
+@pytest.mark.heavy
 def test_a_job_that_is_killed_is_submitted_again_and_costs_no_verdict(tmp_path: Path) -> None:
     folder, seen = tmp_path / "run", list[Progress]()
     kill = Signals(folder.resolve() / "shards" / "2-of-2", signal.SIGKILL)
