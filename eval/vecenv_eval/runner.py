@@ -131,7 +131,8 @@ class Evaluation:
             EngineError: the engine cannot run anything.
             StoreError: another process writes to the results folder, or it cannot be written.
         """
-        _warn_without_gpu(self.config.backend)
+        if self._engine.in_process:
+            _warn_without_gpu(self.config.backend)
         try:
             with store.writing(), Tracking(self.config, store) as tracking:
 
