@@ -274,18 +274,7 @@ class EpisodeLoop:
         self.causes[cause] = None
         self._store.log_error(f"run {self._index} stream {number} ({len(episodes)} episodes)\n{traceback.format_exc()}")
         failed = [
-            Record(
-                suite=episode.suite,
-                task=episode.task,
-                episode=episode.episode,
-                instruction=self._suite.instructions[episode.task],
-                success=False,
-                num_steps=0,
-                reward=0.0,
-                error=cause,
-                run=self._index,
-                batch=number,
-            )
+            Record.of_error(episode, self._suite.instructions[episode.task], cause, run=self._index, batch=number)
             for episode in episodes
             if episode not in self._records or self._records[episode].error
         ]

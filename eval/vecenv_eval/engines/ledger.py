@@ -15,6 +15,7 @@ from vecenv_eval.results import POLICY_NAME, count
 from vecenv_eval.runner import Evaluation
 from vecenv_eval.sink import FolderSink
 from vecenv_eval.store import Record, ResultStore
+from vecenv_eval.store.files import replace_bytes
 
 
 class Ledger:
@@ -78,25 +79,12 @@ class Ledger:
             for name, content in report.files.items():
                 path = self._store.folder / name
                 path.parent.mkdir(parents=True, exist_ok=True)
-                temporary = path.with_name(f".{path.name}.tmp")
-                temporary.write_bytes(content)
-                temporary.replace(path)
+                replace_bytes(path, content)
         self._append(new)
 
     def fail(self, episode: Episode, cause: str, index: int, batch: int) -> None:
         """Write that an episode has no verdict, and why."""
-        record = Record(
-            suite=episode.suite,
-            task=episode.task,
-            episode=episode.episode,
-            instruction=self._instructions[episode.task],
-            success=False,
-            num_steps=0,
-            reward=0.0,
-            error=cause,
-            run=index,
-            batch=batch,
-        )
+        record = Record.of_error(episode, self._instructions[episode.task], cause, run=index, batch=batch)
         self._append([record] if self._is_new(record) else [])
 
     def note(self, cause: str) -> None:
@@ -126,6 +114,5 @@ class Ledger:
         for record in records:
             if record.error:
                 self.note(record.error)
-        failed = any(record.error for record in records)
-        self.error_batches += failed
+        self.error_batches += any(record.error for record in records)
         self.verdicts += sum(not record.error for record in records)

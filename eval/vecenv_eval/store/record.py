@@ -73,6 +73,22 @@ class Record:
     success_final: bool = False
     parts: Mapping[str, bool | float] = field(default_factory=dict)
 
+    @classmethod
+    def of_error(cls, episode: Episode, instruction: str, cause: str, *, run: int, batch: int) -> Record:
+        """The record of an episode without a verdict, because of what ``cause`` says."""
+        return cls(
+            suite=episode.suite,
+            task=episode.task,
+            episode=episode.episode,
+            instruction=instruction,
+            success=False,
+            num_steps=0,
+            reward=0.0,
+            error=cause,
+            run=run,
+            batch=batch,
+        )
+
     @property
     def verdict(self) -> dict[str, Any]:
         """What belongs to the episode alone: everything but when, where and how fast it ran."""
