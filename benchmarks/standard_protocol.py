@@ -362,6 +362,7 @@ def compare(suite: str, condition: str, options: argparse.Namespace) -> list[dic
             "suite": suite,
             "condition": condition,
             "peer": side,
+            "episodes x ticks": f"{sample.count} x {options.ticks[1]}",
             "peer / vecenv, sample": round(found[side][1].total / found["vecenv"][1].total, 2),
             "peer / vecenv, protocol": round(whole[side] / whole["vecenv"], 2),
             "vecenv s, sample": round(found["vecenv"][1].total, 1),
@@ -386,7 +387,7 @@ def totals(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             "peer / vecenv, sample": round(sums["peer s, sample"] / sums["vecenv s, sample"], 2),
             "peer / vecenv, protocol": round(sums["peer h, protocol"] / sums["vecenv h, protocol"], 2),
         }
-        first = {"suite": "all four", "condition": condition, "peer": peer}
+        first = {"suite": "all four", "condition": condition, "peer": peer, "episodes x ticks": "sum"}
         made.append(first | ratio | {name: round(value, 3) for name, value in sums.items()})
     return made
 
@@ -402,19 +403,24 @@ def main() -> None:
     if not (options.peer or options.vla_eval):
         raise SystemExit("name a side to compare with: --peer PYTHON, --vla-eval PYTHON, or both")
     rows: list[dict[str, Any]] = []
+    path, kept = RESULTS / f"{options.name}.json", []
+    if options.add and path.is_file():
+        kept = [row for row in json.loads(path.read_text())["rows"] if row["suite"] in SUITES]
+    notes = {
+        "processes": usable_cores(),
+        "reply_ms": options.reply_ms,
+        "horizons": {suite: PROTOCOL.horizon_of(suite) for suite in SUITES},
+        "extrapolated": "columns that say protocol; see the module's docstring",
+    }
     for condition in options.conditions:
         for suite in options.suites:
             rows += compare(suite, condition, options)
-            print(rows[-1], flush=True)
-    notes = {
-        "sample": {"tasks": options.tasks, "episodes": options.episodes, "ticks": options.ticks},
-        "processes": usable_cores(),
-        "reply_ms": options.reply_ms,
-        "horizons": {suite: PROTOCOL.horizon_of(suite) for suite in options.suites},
-        "extrapolated": "columns that say protocol; see the module's docstring",
-    }
-    rows += totals(rows)
-    report(options.name, rows, title="LIBERO's standard protocol, a sample and what follows from it", notes=notes)
+            new = {(row["suite"], row["condition"], row["peer"]) for row in rows}
+            every = [row for row in kept if (row["suite"], row["condition"], row["peer"]) not in new] + rows
+            every += totals(every)  # after every comparison, so that nothing measured is lost
+            report(
+                options.name, every, title="LIBERO's standard protocol, a sample and what follows from it", notes=notes
+            )
 
 
 def _parse() -> argparse.Namespace:
@@ -429,6 +435,9 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=8, help="episodes of each task, the first ones")
     parser.add_argument("--ticks", type=int, nargs=2, default=(10, 50), help="the two lengths of an episode")
     parser.add_argument("--reply-ms", type=float, default=50.0)
+    parser.add_argument(
+        "--add", action="store_true", help="keep the rows of the results file that are not measured now"
+    )
     parser.add_argument("--name", default="standard_protocol", help="name of the results file")
     parser.add_argument("--table", action="store_true", help="fill the table of docs/performance.md, measure nothing")
     parser.add_argument("--vecenv", type=int, metavar="PORT", help=argparse.SUPPRESS)
