@@ -9,11 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from vecenv.errors import InvalidInput, NotFound
+
+if TYPE_CHECKING:
+    import jax
 
 
 class ImagesUnavailable(NotFound):
@@ -120,6 +123,10 @@ class Rendered(Mapping[str, _Shown]):
         return len(self._names)
 
 
+def _no_cameras() -> Rendered[jax.Array]:
+    return Rendered((), lambda names: {})
+
+
 @dataclass(frozen=True)
 class Egocentric:
     """``observe_egocentric``'s return. Mappings are by camera and may render when they are first read.
@@ -133,6 +140,9 @@ class Egocentric:
         depths: distances from the camera's plane, metres, float32 [B, H, W], pixel by pixel with ``images``.
         segmentations: index into ``instances[slot]`` of what each pixel shows, int16 [B, H, W], pixel by pixel with
             ``images``.
+        images_device, depths_device, segmentations_device: the same as JAX arrays on the device that rendered them,
+            without a copy through the host; any library takes them by DLPack, such as ``torch.from_dlpack``. For
+            rays (``RenderConfig(engine="raytrace")``); where GL renders, reading one raises ``GlError``.
         views: where the cameras are.
         instances: visible things of each slot, B tuples of names; "" is everything without a name.
         pose: navigation pose; always None for manipulation.
@@ -142,6 +152,9 @@ class Egocentric:
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
     depths: Mapping[str, np.ndarray] = field(default_factory=dict)
     segmentations: Mapping[str, np.ndarray] = field(default_factory=dict)
+    images_device: Mapping[str, jax.Array] = field(default_factory=_no_cameras)
+    depths_device: Mapping[str, jax.Array] = field(default_factory=_no_cameras)
+    segmentations_device: Mapping[str, jax.Array] = field(default_factory=_no_cameras)
     views: Mapping[str, CameraView] = field(default_factory=dict)
     instances: tuple[tuple[str, ...], ...] = ()
     pose: None = None

@@ -182,7 +182,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     Raises:
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
     """
-    suite = simulator.suite(config.suite, config.protocol)
+    suite = simulator.suite_of(config)
     tasks, episodes = chosen_episodes(config, suite)
     _check_make(simulator, config)
     check_cameras(config, suite, tasks)

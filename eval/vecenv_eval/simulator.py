@@ -5,18 +5,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import vecenv
 from vecenv import protocols
 from vecenv.contract import BatchEnv
+from vecenv.errors import VecenvError
 from vecenv.libero.render.options import ALIASES
 from vecenv.libero.scene.arenas import ARENAS, camera_names
-from vecenv.libero.tasks.suites import TaskSpec, list_tasks
+from vecenv.libero.tasks.export import exported_tasks
+from vecenv.libero.tasks.sources import Task, installed_tasks
+from vecenv.libero.tasks.suites import NUM_EPISODES
 from vecenv.simpler.config import CAMERAS as SIMPLER_CAMERAS
 from vecenv.util.names import unknown
-from vecenv_eval.config import ConfigError
+from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.episodes import MAX_SLOTS, Suite
 
 # A slot of SIMPLER is a PhysX scene of its own.
@@ -25,22 +28,35 @@ _SIMPLER_SLOTS = 50
 
 @dataclass(frozen=True)
 class Simulator:
-    """The two functions the runner needs from a library of environments.
+    """The functions the runner needs from a library of environments.
 
     Attributes:
         suite: describes a suite under a protocol, both by name, or raises ``ConfigError``.
         make: builds an environment, as ``vecenv.make`` does: ``tasks`` times ``episodes`` slots.
         check: raises a ``VecenvError`` for options that ``make`` would refuse, without building anything.
+        exported: as ``suite``, of a suite in an exported folder; None where there are no such folders.
     """
 
     suite: Callable[[str, str], Suite]
     make: Callable[..., BatchEnv]
     check: Callable[[str, Mapping[str, object]], object] = lambda suite, options: None
+    exported: Callable[[str, str, str], Suite] | None = None
+
+    def suite_of(self, config: EvalConfig) -> Suite:
+        """The suite that a config names, read from its exported folder if it has one.
+
+        Raises:
+            ConfigError: there is no such suite, protocol or folder, or they do not go together.
+        """
+        scenes = config.env_args.get("scenes")
+        if scenes is None or self.exported is None:
+            return self.suite(config.suite, config.protocol)
+        return self.exported(config.suite, config.protocol, str(scenes))
 
 
 def vecenv_simulator() -> Simulator:
     """``vecenv`` itself."""
-    return Simulator(describe_suite, vecenv.make, vecenv.make_config)
+    return Simulator(describe_suite, vecenv.make, vecenv.make_config, describe_exported)
 
 
 def describe_suite(name: str, protocol: str = protocols.DEFAULT) -> Suite:
@@ -49,30 +65,63 @@ def describe_suite(name: str, protocol: str = protocols.DEFAULT) -> Suite:
     Raises:
         ConfigError: there is no suite or protocol of that name, or they do not go together.
     """
-    suites = vecenv.list_suites()
-    if name not in suites:
-        raise ConfigError(unknown("suite", name, suites))
+    family = _family(name)
     try:
         per_task = vecenv.eval_metadata(name, protocol)["episodes_per_task"]
     except ValueError as error:
         raise ConfigError(str(error)) from error
+    if family != protocols.SIMPLER:
+        return _libero(name, installed_tasks(name), per_task)
     tasks = vecenv.list_tasks(name)
-    simpler = vecenv.family(name) == protocols.SIMPLER
     return Suite(
         name=name,
         instructions=tuple(task.instruction for task in tasks),
-        # SIMPLER's environments exchange scenes by themselves, so other tasks need no new environment.
-        scenes=("",) * len(tasks) if simpler else tuple(task.problem().scene_key() for task in list_tasks(name)),
-        # LIBERO has 50 starts of every task, whatever a protocol runs of them.
-        num_episodes=per_task if simpler else max(per_task, vecenv.eval_metadata(name)["episodes_per_task"]),
-        every=None if simpler else per_task,
+        # Environments exchange scenes by themselves, so other tasks need no new environment.
+        scenes=("",) * len(tasks),
+        num_episodes=per_task,
         tasks=tuple(task.name for task in tasks),
-        max_slots=_SIMPLER_SLOTS if simpler else MAX_SLOTS,
-        cameras=(SIMPLER_CAMERAS,) * len(tasks) if simpler else tuple(map(_cameras, list_tasks(name))),
+        max_slots=_SIMPLER_SLOTS,
+        cameras=(SIMPLER_CAMERAS,) * len(tasks),
     )
 
 
-def _cameras(task: TaskSpec) -> tuple[str, ...]:
+def describe_exported(name: str, protocol: str, folder: str) -> Suite:
+    """Describe a LIBERO suite that ``vecenv compile`` wrote into a folder; the LIBERO packages are not read.
+
+    Raises:
+        ConfigError: there is no such suite, protocol or folder, or they do not go together.
+    """
+    if _family(name) == protocols.SIMPLER:
+        raise ConfigError(f"scenes={folder}: {name} is of SIMPLER, whose scenes are not exported")
+    try:
+        per_task = protocols.protocol(protocol, protocols.LIBERO).episodes or NUM_EPISODES
+        return _libero(name, exported_tasks(folder, name), per_task)
+    except (VecenvError, ValueError) as error:
+        raise ConfigError(str(error)) from error
+
+
+def _family(name: str) -> str:
+    suites = vecenv.list_suites()
+    if name not in suites:
+        raise ConfigError(unknown("suite", name, suites))
+    return vecenv.family(name)
+
+
+def _libero(name: str, tasks: Sequence[Task], per_task: int) -> Suite:
+    return Suite(
+        name=name,
+        instructions=tuple(task.instruction for task in tasks),
+        scenes=tuple(task.problem().scene_key() for task in tasks),
+        # There are 50 starts of every task, whatever a protocol runs of them.
+        num_episodes=max(per_task, NUM_EPISODES),
+        every=per_task,
+        tasks=tuple(task.name for task in tasks),
+        max_slots=MAX_SLOTS,
+        cameras=tuple(map(_cameras, tasks)),
+    )
+
+
+def _cameras(task: Task) -> tuple[str, ...]:
     """Names of the cameras in the scene of a LIBERO task, and their aliases."""
     there = camera_names(ARENAS[task.problem().name])
     return (*there, *(alias for alias, name in ALIASES.items() if name in there))

@@ -26,6 +26,7 @@ class LiberoError(InvalidInput):
     """An option or call that this environment cannot honour; the message says what would be right."""
 
 
+ARRAYS = ("numpy", "jax")
 # Options that have no default of their own.
 _DECIDED_BY_PROTOCOL = ("start", "success")
 
@@ -83,6 +84,9 @@ class LiberoConfig:
             read.
         cameras: the cameras that observations show, in this order: names of the scene's cameras (``agentview``,
             ``wrist``, ``frontview``, ...) or of those that ``render`` adds; None for all of them.
+        arrays: ``"numpy"``, or ``"jax"``: verdicts, proprioception, states and images are JAX arrays on the default
+            device, of 32 bits unless x64 is on; images stay where rays made them. Actions and states may be given as
+            JAX arrays in both cases. ``done``, ``placement`` and ``observe_objects`` are NumPy's in both.
         scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and no LIBERO
             or robosuite files are needed. None for the installed packages.
         waypoint: tolerances and speeds of ``step_ee_pose`` and ``step_waypoints``; also a mapping of its fields.
@@ -104,6 +108,7 @@ class LiberoConfig:
     num_devices: int = 1
     render: Mapping[str, Any] | RenderConfig | None = None
     cameras: list[str] | tuple[str, ...] | None = None
+    arrays: str = "numpy"
     scenes: str | Path | None = None
     waypoint: waypoint.WaypointConfig = field(default_factory=waypoint.WaypointConfig)
 
@@ -113,6 +118,7 @@ class LiberoConfig:
             ("backend", BACKENDS),
             ("geometry", PROFILES),
             ("contacts", CONTACTS),
+            ("arrays", ARRAYS),
             ("start", ("settled", "raw")),
             ("success", SUCCESS_MODES),
         ):

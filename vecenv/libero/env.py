@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar, cast
 
 import mujoco
 import numpy as np
@@ -17,7 +18,7 @@ import numpy.typing as npt
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv import protocols
-from vecenv.contract import Control, State
+from vecenv.contract import Control, Metrics, ResetInfo, State
 from vecenv.controllers import waypoint
 from vecenv.libero import observe, starts
 from vecenv.libero.config import LiberoConfig, LiberoError
@@ -35,6 +36,12 @@ from vecenv.libero.tasks.sources import Task, installed_tasks
 from vecenv.libero.tasks.suites import NUM_EPISODES
 from vecenv.observations import Egocentric, Objects
 from vecenv.slots import SlotBatch
+from vecenv.util.transfers import put
+
+_Result = TypeVar("_Result")
+_Kind = TypeVar("_Kind", bound=Control)
+# Arrays of ``State`` that ``set_state`` takes.
+_STATE = ("qpos", "qvel", "time")
 
 
 @dataclass(frozen=True)
@@ -71,6 +78,7 @@ class LiberoEnv(SlotBatch):
         self.config = replace(config, **vars(self._rules))
         self._sources = tasks
         self._physics: Physics | None = None
+        self._on_device = config.arrays == "jax"
         self._cameras = CameraRig(self._rules.render, self.num_envs, config.cameras)
         self._place(placement)
 
@@ -185,6 +193,32 @@ class LiberoEnv(SlotBatch):
             self._physics.close()
         self._physics = None
 
+    def _delivered(self, result: _Result) -> _Result:
+        """What a verb returns, in the arrays that the configuration asks for."""
+        return put(result) if self._on_device else result
+
+    def reset(self) -> ResetInfo:
+        """Make every slot live: finished slots start their episode again, live ones are not changed.
+
+        Returns:
+            Episode metadata of every slot; no observation.
+        """
+        return self._delivered(super().reset())
+
+    def evaluate(self) -> Metrics:
+        """The verdict of each slot as of its last executed tick."""
+        return self._delivered(super().evaluate())
+
+    def _control(
+        self,
+        kind: type[_Kind],
+        reward: np.ndarray,
+        before: np.ndarray,
+        sanitized: np.ndarray | None = None,
+        **extra: np.ndarray | tuple[str, ...],
+    ) -> _Kind:
+        return self._delivered(super()._control(kind, reward, before, sanitized, **extra))
+
     # -- stepping ------------------------------------------------------------------------------------------------------
 
     def step_continuous(self, actions: npt.ArrayLike) -> Control:
@@ -253,13 +287,19 @@ class LiberoEnv(SlotBatch):
         groups = self.physics.groups
         problems = [self._tasks[int(self._placement.task[group.slots[0]])].problem for group in groups]
         seen = self._cameras.capture(groups, problems, self.slot_indices(slots))
-        return Egocentric(
-            state=observe.proprioception(self.physics),
-            images=seen.images,
-            depths=seen.depths,
-            segmentations=seen.segmentations,
-            views=seen.views,
-            instances=seen.instances,
+        in_jax = self._on_device and self._rules.render.engine == "raytrace"
+        return self._delivered(
+            Egocentric(
+                state=observe.proprioception(self.physics),
+                images=cast(Any, seen.images_device) if in_jax else seen.images,
+                depths=cast(Any, seen.depths_device) if in_jax else seen.depths,
+                segmentations=cast(Any, seen.segmentations_device) if in_jax else seen.segmentations,
+                images_device=seen.images_device,
+                depths_device=seen.depths_device,
+                segmentations_device=seen.segmentations_device,
+                views=seen.views,
+                instances=seen.instances,
+            )
         )
 
     def set_visuals(self, options: VisualOptions | Sequence[VisualOptions]) -> None:
@@ -343,6 +383,9 @@ class LiberoEnv(SlotBatch):
 
     def state(self) -> State:
         """Physics state of every slot, a copy."""
+        return self._delivered(self._state())
+
+    def _state(self) -> State:
         self._check_live()
         groups = self.physics.groups
         nq, nv = np.zeros(self.num_envs, int), np.zeros(self.num_envs, int)
@@ -373,15 +416,13 @@ class LiberoEnv(SlotBatch):
             LiberoError: a wrong shape, or a number that is not finite.
         """
         self._check_live()
-        current = self.state()
-        chosen = state or State(
-            qpos=current.qpos if qpos is None else np.asarray(qpos, float),
-            qvel=current.qvel if qvel is None else np.asarray(qvel, float),
-            time=current.time if time is None else np.asarray(time, float),
-            nq=current.nq,
-            nv=current.nv,
+        current = self._state()
+        given = {"qpos": qpos, "qvel": qvel, "time": time} if state is None else vars(state)
+        arrays = {name: getattr(current, name) if given[name] is None else given[name] for name in _STATE}
+        chosen = State(
+            **{name: np.asarray(array, float) for name, array in arrays.items()}, nq=current.nq, nv=current.nv
         )
-        for name in ("qpos", "qvel", "time"):
+        for name in _STATE:
             have, need = getattr(chosen, name).shape, getattr(current, name).shape
             if len(have) != len(need) or have[0] != need[0] or have[1:] < need[1:]:
                 raise LiberoError(f"set_state: {name} has shape {have}; expected {need}")

@@ -120,7 +120,7 @@ def _merge_one(
         simulator: what knows the suite.
     """
     every = _check(out, sources, any_versions)
-    suite = simulator.suite(config.suite, config.protocol)
+    suite = simulator.suite_of(config)
     _, episodes = chosen_episodes(config, suite)
     planned = [Episode(suite.name, task, episode) for task, some in episodes.items() for episode in some]
     _join(every, frozenset(planned))  # refuses what does not fit before a folder is made

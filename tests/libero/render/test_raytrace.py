@@ -30,7 +30,8 @@ from vecenv.libero.render.options import (
     UserCamera,
     VisualOptions,
 )
-from vecenv.libero.render.raytrace import RayTracer, Style, poses, style_of
+from vecenv.libero.render.rays import style_of
+from vecenv.libero.render.raytrace import RayTracer, Style, poses
 from vecenv.libero.render.scenery import Scenery, installed_scenery
 from vecenv.libero.tasks.sources import installed_tasks
 from vecenv.libero.tasks.suites import list_tasks

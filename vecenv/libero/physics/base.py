@@ -16,10 +16,12 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from vecenv.controllers import waypoint
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.scene import Scene
+from vecenv.util.arrays import AnyArray
 
 SUBSTEPS = 25
 # Substeps after which robosuite's observables have read the kinematics and the finger joints.
@@ -62,6 +64,24 @@ class Start:
         return dataclasses.replace(self, **{name: array[chosen] for name, array in given.items()})
 
 
+class Shown(NamedTuple):
+    """What camera images show of the slots of one scene: copies, on the device where the physics is.
+
+    Attributes:
+        slots: their indices in the batch, int [n].
+        qpos: positions, [N, nq]; the first n rows are the slots', in their order.
+        body_pos: positions of the bodies in their parents, metres, [N, nbody, 3].
+        body_quat: orientations likewise, wxyz, [N, nbody, 4].
+        mesh: the devices over which the rows are split evenly; None for one device, or the host.
+    """
+
+    slots: np.ndarray
+    qpos: AnyArray
+    body_pos: AnyArray
+    body_quat: AnyArray
+    mesh: Mesh | None = None
+
+
 class Group(Protocol):
     """The slots of one scene; arrays are read-only and as of the last call, poses in the world frame.
 
@@ -81,6 +101,10 @@ class Group(Protocol):
     @property
     def seen_qpos(self) -> np.ndarray:
         """Positions as camera images show them, [n, nq]."""
+        ...
+
+    def shown(self) -> Shown:
+        """What camera images show now."""
         ...
 
     @property

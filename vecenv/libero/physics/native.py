@@ -30,7 +30,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from vecenv.controllers.osc_numba import ArmViews, Controllers
-from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Physics, Start
+from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS, Physics, Shown, Start
 from vecenv.libero.physics.colliders import install as collider
 from vecenv.libero.robot import ARM_JOINTS, HOME_QPOS
 from vecenv.libero.scene.scene import Scene
@@ -252,6 +252,10 @@ class Group:
     def expand(self, field: str) -> np.ndarray:
         """A field of ``MjModel`` that may differ between slots, a copy, [n, ...]."""
         return np.concatenate([block.batch.expand(field) for block in self.blocks])
+
+    def shown(self) -> Shown:
+        """What camera images show now."""
+        return Shown(self.slots, self.seen_qpos.copy(), self.expand("body_pos"), self.expand("body_quat"))
 
     @property
     def state(self) -> np.ndarray:

@@ -7,14 +7,16 @@ drawn before an image is read, and no GL library is loaded before that.
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
+import jax
 import mujoco
 import numpy as np
 
@@ -25,9 +27,10 @@ from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.observations import CameraView, Rendered, choose_cameras
+from vecenv.util.transfers import fetch
 
 if TYPE_CHECKING:
-    from vecenv.libero.render.raytrace import RayRenderer
+    from vecenv.libero.render.rays import RayRenderer
 
 _StageKey = tuple[SceneKey, str, str]
 # How many stages stay compiled after the last environment that used them is closed; one takes 0.9 GB.
@@ -139,7 +142,7 @@ class CameraRig:
         if self._closed:
             raise GlError("the environment is closed: images must be read before")
         if self._rays is None:
-            from vecenv.libero.render.raytrace import RayRenderer  # needs the extra `warp`
+            from vecenv.libero.render.rays import RayRenderer  # needs the extra `warp`
 
             self._rays = RayRenderer(self.config)
         return self._rays
@@ -163,6 +166,8 @@ class Capture:
         images: uint8 [B, H, W, 3] by camera, rendered when read; so are all mappings here.
         depths: metres from the camera's plane, float32 [B, H, W] by camera.
         segmentations: indices into ``instances``, int16 [B, H, W] by camera.
+        images_device, depths_device, segmentations_device: the same as JAX arrays on the device that rendered them;
+            reading one raises ``GlError`` where GL renders.
         views: the intrinsics and poses of each camera.
         instances: by slot, the names that segmentation images index.
     """
@@ -170,52 +175,72 @@ class Capture:
     def __init__(self, rig: CameraRig, groups: Sequence[Group], problems: Sequence[Problem], slots: np.ndarray) -> None:
         self._rig, self._problems, self._drawn = rig, tuple(problems), slots
         self._models = [group.scene.model for group in groups]
-        count = sum(len(group.slots) for group in groups)
-        shots: dict[int, Shot] = {}
-        instances: list[tuple[str, ...]] = [()] * count
-        for index, group in enumerate(groups):
-            pos, quat = group.expand("body_pos"), group.expand("body_quat")
-            qpos = group.seen_qpos.copy()
-            for row, slot in enumerate(group.slots.tolist()):
-                shots[slot] = Shot(index, Pose(qpos[row], pos[row], quat[row]), rig.options[slot])
-                instances[slot] = ("", ROBOT, *group.scene.entities)
-        self._shots = [shots[slot] for slot in range(count)]
+        self._options = list(rig.options)
+        self._shown = [group.shown() for group in groups]
+        instances: list[tuple[str, ...]] = [()] * len(self._options)
+        for group in groups:
+            names = ("", ROBOT, *group.scene.entities)
+            for slot in group.slots.tolist():
+                instances[slot] = names
         self.instances = tuple(instances)
         names = rig.names(self._models)
-        self.images = Rendered(names, self._rendering(Wanted(), lambda frames: frames.rgb))
-        self.depths = Rendered(names, self._rendering(Wanted(rgb=False, depth=True), lambda frames: frames.depth))
-        self.segmentations = Rendered(
-            names, self._rendering(Wanted(rgb=False, segmentation=True), lambda frames: frames.segmentation)
+        self.images, self.images_device = self._of(names, Wanted(), lambda frames: frames.rgb)
+        self.depths, self.depths_device = self._of(names, Wanted(rgb=False, depth=True), lambda frames: frames.depth)
+        self.segmentations, self.segmentations_device = self._of(
+            names, Wanted(rgb=False, segmentation=True), lambda frames: frames.segmentation
         )
         self.views = Rendered(names, self._views)
+
+    def _of(
+        self, names: Sequence[str], wanted: Wanted, pick: Callable[[Frames], Mapping[str, np.ndarray]]
+    ) -> tuple[Rendered[np.ndarray], Rendered[jax.Array]]:
+        """One kind of images: in NumPy, and on the device."""
+        if self._rig.config.engine != "raytrace":
+            return Rendered(names, self._rendering(wanted, pick)), Rendered(names, _not_on_a_device)
+        on_device = Rendered(names, functools.partial(self._traced, wanted))
+        return Rendered(names, functools.partial(self._fetched, on_device)), on_device
+
+    def _traced(self, wanted: Wanted, names: Sequence[str]) -> Mapping[str, jax.Array]:
+        """Images of all slots on the device; the time until they are there is the first reader's."""
+        with self._rig.timed():
+            return self._rig.rays().render(
+                self._shown, self._problems, self._models, names, wanted, self._options, self._drawn
+            )
+
+    def _fetched(self, on_device: Rendered[jax.Array], names: Sequence[str]) -> Mapping[str, np.ndarray]:
+        with self._rig.timed():
+            on_device.prepare(*names)
+            return dict(zip(names, fetch([on_device[name] for name in names]), strict=True))
 
     def _rendering(
         self, wanted: Wanted, pick: Callable[[Frames], Mapping[str, np.ndarray]]
     ) -> Callable[[Sequence[str]], Mapping[str, np.ndarray]]:
         def render(names: Sequence[str]) -> Mapping[str, np.ndarray]:
             with self._rig.timed():
-                return self._of_all_slots(pick(self._frames(names, wanted)))
+                renderer = self._rig.renderer(self._rig.stages(self._problems, self._models))
+                shots = [self._shots[slot] for slot in self._drawn]
+                return self._of_all_slots(pick(renderer.render(shots, self._cameras(names), wanted)))
 
         return render
 
-    def _frames(self, names: Sequence[str], wanted: Wanted) -> Frames:
-        """Images of the drawn slots alone, in their order, and of none twice but on the ray tracer."""
-        shots = [self._shots[slot] for slot in self._drawn]
-        if self._rig.config.engine == "raytrace":
-            # A compiled program draws one number of slots: powers of two keep the programs few.
-            shots += shots[:1] * (min(1 << (len(shots) - 1).bit_length(), len(self._shots)) - len(shots))
-            return self._rig.rays().render(shots, self._problems, self._models, names, wanted)
-        renderer = self._rig.renderer(self._rig.stages(self._problems, self._models))
-        return renderer.render(shots, self._cameras(names), wanted)
+    @functools.cached_property
+    def _shots(self) -> list[Shot]:
+        """What to render of each slot."""
+        shots: dict[int, Shot] = {}
+        for index, shown in enumerate(self._shown):
+            qpos, pos, quat = (np.asarray(array, float) for array in (shown.qpos, shown.body_pos, shown.body_quat))
+            for row, slot in enumerate(shown.slots.tolist()):
+                shots[slot] = Shot(index, Pose(qpos[row], pos[row], quat[row]), self._options[slot])
+        return [shots[slot] for slot in range(len(shots))]
 
     def _of_all_slots(self, images: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Images [B, ...] from those of the drawn slots."""
-        count, drawn = len(self._shots), len(self._drawn)
-        if drawn == count:
+        count = len(self._options)
+        if len(self._drawn) == count:
             return images
         every = {name: np.zeros((count, *array.shape[1:]), array.dtype) for name, array in images.items()}
         for name, array in images.items():
-            every[name][self._drawn] = array[:drawn]
+            every[name][self._drawn] = array
         return every
 
     def _views(self, names: Sequence[str]) -> dict[str, CameraView]:
@@ -235,6 +260,13 @@ class Capture:
     def _cameras(self, names: Sequence[str]) -> list[str | UserCamera]:
         given = {camera.name: camera for camera in self._rig.config.cameras}
         return [given.get(name, name) for name in names]
+
+
+def _not_on_a_device(names: Sequence[str]) -> NoReturn:
+    raise GlError(
+        f"images of {', '.join(names)} are drawn by GL, which leaves them in the host's memory: read `images`, or have "
+        "rays traced on the device with render=RenderConfig(engine='raytrace')"
+    )
 
 
 def _camera_names(models: Sequence[mujoco.MjModel], given: Sequence[UserCamera]) -> tuple[str, ...]:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -20,22 +21,17 @@ import numpy as np
 from jaxtyping import PyTree
 from mujoco import mjx
 
-from vecenv.libero.physics.private import render_context
-from vecenv.libero.render.drawing import Pose, View
-from vecenv.libero.render.gl import Frames, Shot, Wanted
-from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, UserCamera, VisualOptions
+from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderError
 from vecenv.libero.render.ray_kernel import make_kernel
 from vecenv.libero.render.ray_light import HEADLIGHT
-from vecenv.libero.render.scenery import Scenery, installed_scenery
+from vecenv.libero.render.scenery import Scenery
 from vecenv.libero.render.surfaces import drawn_colors
-from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.util.mapped import Sized
 from vecenv.util.rotations import quat_to_mat
 
 if TYPE_CHECKING:
     from vecenv.libero.physics.private import RenderContext
 
-_LookKey = tuple[SceneKey, tuple[str, ...], Wanted]
 # Threads of a block on the GPU, registers of a thread, and the tile of pixels, rows and columns, that threads next to
 # each other trace: rays that travel together are faster. Measured on an H200, benchmarks/render_gpu.py.
 BLOCK, REGISTERS, TILE = 128, 96, (8, 8)
@@ -93,6 +89,7 @@ class RayTracer:
         tile: most rows and columns of pixels that neighbouring threads trace; ``(1, 1)`` for row by row.
         registers: most registers of a thread on the GPU; 0 leaves it to the compiler.
         culling: whether faces are visible from their front only, as in GL; without, rendering is 7 % faster.
+        devices: Warp's names of the devices that render, such as ``"cuda:1"``; None for the default device.
 
     Raises:
         RenderError: the scenery has no such camera.
@@ -113,6 +110,7 @@ class RayTracer:
         tile: tuple[int, int] = TILE,
         registers: int = REGISTERS,
         culling: bool = True,
+        devices: Sequence[str] | None = None,
     ) -> None:
         self.scenery, self.height, self.width, self.cameras = scenery, height, width, tuple(cameras)
         self._wanted = rgb, depth, segmentation
@@ -125,8 +123,9 @@ class RayTracer:
         self._tile = math.gcd(height, tile[0]), math.gcd(width, tile[1])
         self._blank = mjx.make_data(model, impl="warp", naconmax=1, njmax=1)
         self._options = {"samples_per_pixel": samples, "enable_backface_culling": culling}
-        self._registers = registers
+        self._registers, self._devices = registers, devices
         self._contexts: dict[int, Any] = {}
+        self._making = threading.Lock()
         self._look = Sized(self._look_at, self._context)
 
     @property
@@ -155,25 +154,27 @@ class RayTracer:
         return self._look(xpos, xquat, qpos) if style is None else self._look(xpos, xquat, qpos, style)
 
     def _context(self, num_worlds: int) -> Any:
-        if num_worlds not in self._contexts:
-            rgb, depth, segmentation = self._wanted
-            with jax.ensure_compile_time_eval():
-                context = mjx.create_render_context(
-                    self._model,
-                    nworld=num_worlds,
-                    cam_res=(self.width, self.height),
-                    cam_active=self._camera_ids,
-                    render_rgb=rgb,
-                    render_depth=depth,
-                    render_seg=segmentation,
-                    enabled_geom_groups=[1],
-                    **self._options,
-                )
-                rays = render_context.get(context.pytree())
-                self._tile_rays(rays)
-                rays._megakernel = make_kernel(self._model, rays, self._registers)
-                self._contexts[num_worlds] = context
-        return self._contexts[num_worlds].pytree()
+        with self._making:  # with several devices, a thread for each traces at the same time
+            if num_worlds not in self._contexts:
+                rgb, depth, segmentation = self._wanted
+                with jax.ensure_compile_time_eval():
+                    context = mjx.create_render_context(
+                        self._model,
+                        nworld=num_worlds,
+                        devices=self._devices,
+                        cam_res=(self.width, self.height),
+                        cam_active=self._camera_ids,
+                        render_rgb=rgb,
+                        render_depth=depth,
+                        render_seg=segmentation,
+                        enabled_geom_groups=[1],
+                        **self._options,
+                    )
+                    for rays in context._contexts.values():  # one a device
+                        self._tile_rays(rays)
+                        rays._megakernel = make_kernel(self._model, rays, self._registers)
+                    self._contexts[num_worlds] = context
+            return self._contexts[num_worlds].pytree()
 
     def _tile_rays(self, context: RenderContext) -> None:
         """Reorder a render context's rays from rows of pixels to tiles, for each camera and sample."""
@@ -264,117 +265,6 @@ class RayTracer:
         return table[codes[..., 0]]  # -1, the table's last entry, is the background
 
 
-_Compiled = tuple[RayTracer, Callable[..., Seen]]
-
-
-class RayRenderer:
-    """Renders batches as ``vecenv.libero.render.gl.GlRenderer`` does, without GL: one call of ``RayTracer`` per
-    scene.
-
-    Args:
-        config: sizes, level of detail and user cameras.
-    """
-
-    def __init__(self, config: RenderConfig) -> None:
-        self._config = config
-        self._user_cameras = {camera.name: camera for camera in config.cameras}
-        self._looks: dict[_LookKey, _Compiled] = {}
-
-    def render(
-        self,
-        shots: Sequence[Shot],
-        problems: Sequence[Problem],
-        models: Sequence[mujoco.MjModel],
-        cameras: Sequence[str],
-        wanted: Wanted,
-    ) -> Frames:
-        """Render every slot through every camera.
-
-        Args:
-            shots: one per slot; their stages index ``problems``.
-            problems, models: the scenes and their physics models.
-            cameras: names of the scenes' cameras or of the configuration's.
-            wanted: which images.
-
-        Raises:
-            RenderError: a scene has no such camera or instance, or a slot's options swap textures or colour materials.
-        """
-        size = (len(shots), self._config.height, self._config.width)
-        rgb = {name: np.zeros((*size, 3), np.uint8) for name in cameras if wanted.rgb}
-        depth = {name: np.zeros(size, np.float32) for name in cameras if wanted.depth}
-        segmentation = {name: np.zeros(size, np.int16) for name in cameras if wanted.segmentation}
-        for stage, (problem, model) in enumerate(zip(problems, models, strict=True)):
-            slots = [slot for slot, shot in enumerate(shots) if shot.stage == stage]
-            tracer, look = self._look(problem, tuple(cameras), wanted)
-            styles = self._styles(tracer, cameras, slots, [shots[slot].options for slot in slots])
-            seen = look(*_states(model, [shots[slot].pose for slot in slots]), *styles)
-            for images, made in ((rgb, seen.rgb), (depth, seen.depth), (segmentation, seen.segmentation)):
-                for number, name in enumerate(cameras if made is not None else ()):
-                    images[name][slots] = np.asarray(made)[:, number]
-        return Frames(rgb, depth, segmentation, {})
-
-    def close(self) -> None:
-        """Drop what was compiled. Closing twice is harmless."""
-        self._looks = {}
-
-    def _look(self, problem: Problem, cameras: tuple[str, ...], wanted: Wanted) -> _Compiled:
-        key = (problem.scene_key(), cameras, wanted)
-        if key not in self._looks:
-            tracer = RayTracer(
-                installed_scenery(problem, self._config.lod, self._config.colors),
-                height=self._config.height,
-                width=self._config.width,
-                cameras=[None if name in self._user_cameras else name for name in cameras],
-                rgb=wanted.rgb,
-                depth=wanted.depth,
-                segmentation=wanted.segmentation,
-            )
-            self._looks[key] = tracer, jax.jit(jax.vmap(tracer.look))
-        return self._looks[key]
-
-    def _styles(
-        self, tracer: RayTracer, cameras: Sequence[str], slots: Sequence[int], options: Sequence[VisualOptions]
-    ) -> tuple[Style, ...]:
-        """The slots' styles, stacked; empty if nothing differs from the plain style."""
-        if all(name not in self._user_cameras for name in cameras) and all(each == VisualOptions() for each in options):
-            return ()
-        own = [[self._user_cameras.get(name, name) for name in cameras]] * len(slots)
-        styles = [style_of(tracer, *each) for each in zip(options, own, slots, strict=True)]
-        return (jax.tree.map(lambda *arrays: np.stack(arrays), *styles),)
-
-
-def style_of(tracer: RayTracer, options: VisualOptions, cameras: Sequence[str | UserCamera], slot: int) -> Style:
-    """The style of a slot's visual options and cameras; ``cameras`` are those of the tracer.
-
-    Raises:
-        RenderError: the options swap textures, or name something to colour that is no instance of the scene.
-    """
-    if options.textures:
-        raise RenderError("engine='raytrace' cannot swap textures; use engine='gl'")
-    style = tracer.plain_style
-    style.light[:] = options.light * np.asarray(options.light_color)
-    style.lamps[:] = options.light_shift
-    for name, color in options.colors.items():
-        if name not in tracer.scenery.instances[1:]:
-            there = ", ".join(tracer.scenery.instances[1:])
-            raise RenderError(f"engine='raytrace' colours instances only, and {name!r} is none; instances: {there}")
-        style.colors[tracer.scenery.instances.index(name)] = color
-    for number, camera in enumerate(cameras):
-        view = View(np.asarray(style.pos[number]), np.asarray(style.turn[number]), float(style.fovy[number]))
-        name = camera.name if isinstance(camera, UserCamera) else camera
-        view = View(*camera.in_slot(slot)) if isinstance(camera, UserCamera) else view
-        shift = next((options.cameras[key] for key in _names(name) if key in options.cameras), None)
-        view = view if shift is None else view.shifted(shift)
-        style.pos[number], style.turn[number], style.fovy[number] = view.pos, view.mat, view.fovy
-    return style
-
-
-def _names(camera: str) -> tuple[str, ...]:
-    """A camera's name and its aliases."""
-    real = ALIASES.get(camera, camera)
-    return real, *(alias for alias, other in ALIASES.items() if other == real)
-
-
 def _lamps(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """MJX's fields of the lights, with the headlight as one more light if it is on."""
     head, colors = model.vis.headlight, ("ambient", "diffuse", "specular")
@@ -394,13 +284,6 @@ def _lamps(model: mujoco.MjModel) -> dict[str, np.ndarray]:
         extra = np.array([value] if head.active else [], own.dtype).reshape(-1, *own.shape[1:])
         found[f"light_{name}"] = np.concatenate([own, extra]).astype(dtype)
     return found
-
-
-def _states(model: mujoco.MjModel, shown: Sequence[Pose]) -> tuple[np.ndarray, ...]:
-    qpos, body_pos, body_quat = (
-        np.stack([getattr(pose, name) for pose in shown]) for name in ("qpos", "body_pos", "body_quat")
-    )
-    return (*poses(model, qpos, body_pos, body_quat), qpos.astype(np.float32))
 
 
 def poses(

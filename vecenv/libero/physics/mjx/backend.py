@@ -19,7 +19,7 @@ from jax.sharding import Mesh
 from mujoco import mjx
 
 from vecenv.controllers import waypoint
-from vecenv.libero.physics.base import FollowResult, Physics, RunResult, Start, Watcher
+from vecenv.libero.physics.base import FollowResult, Physics, RunResult, Shown, Start, Watcher
 from vecenv.libero.physics.mjx.model import Build
 from vecenv.libero.physics.mjx.options import MjxError
 from vecenv.libero.physics.mjx.programs import programs_of
@@ -35,7 +35,7 @@ class MjxGroup:
 
     def __init__(self, built: Build, slots: np.ndarray, mesh: Mesh | None) -> None:
         self.scene, self.slots, self.built = built.scene, slots, built
-        self.compiled = programs_of(built, mesh)
+        self.compiled, self.mesh = programs_of(built, mesh), mesh
         devices = 1 if mesh is None else mesh.size
         # Every device gets the same number of worlds; those past the last slot never move.
         self.num_worlds = -(-len(slots) // devices) * devices
@@ -124,6 +124,11 @@ class MjxGroup:
     def touch(self) -> np.ndarray:
         """[n, nsensordata]."""
         return self._fetch("sensordata")
+
+    def shown(self) -> Shown:
+        """What camera images show now; the next step takes the memory of the worlds, so these are copies."""
+        worlds = self.worlds
+        return Shown(self.slots, *_copies((worlds.seen_qpos, worlds.body_pos, worlds.body_quat)), mesh=self.mesh)
 
     def expand(self, field: str) -> np.ndarray:
         """``body_pos`` or ``body_quat`` of every slot, a copy, [n, nbody, ...]."""
@@ -282,20 +287,29 @@ class MjxPhysics(Physics[MjxGroup]):
         ran = RunResult(*(np.zeros(self.num_envs, kind) for kind in (int, bool, bool)))
         for group, (loop, _) in calls:
             group.replace(loop.worlds)
+            found = {name: getattr(loop, name) for name in vars(ran)} | {"fault": loop.worlds.fault}
+            found = jax.device_get(found)  # one wait for all of them
             for name, array in vars(ran).items():
-                array[group.slots] = group.get(getattr(loop, name))
-        self._collect_faults()
+                array[group.slots] = group.get(found[name])
+            self._note_faults(group, group.get(found["fault"]))
         return ran, [(group, extra) for group, (_, extra) in calls]
 
     def _collect_faults(self) -> None:
         for group in self._groups:
-            bits = group.get(group.worlds.fault)
-            for row in np.flatnonzero(bits):
-                self.faults.setdefault(int(group.slots[row]), fault_text(int(bits[row])))
+            self._note_faults(group, group.get(group.worlds.fault))
+
+    def _note_faults(self, group: MjxGroup, bits: np.ndarray) -> None:
+        for row in np.flatnonzero(bits):
+            self.faults.setdefault(int(group.slots[row]), fault_text(int(bits[row])))
 
     def close(self) -> None:
         """Release the worlds."""
         self._groups = []
+
+
+@jax.jit
+def _copies(arrays: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    return tuple(map(jnp.copy, arrays))
 
 
 def _table(group: MjxGroup) -> goals.GoalTable:
