@@ -275,8 +275,9 @@ def _fits(
     hit = _meets(around, begin, hands, config.body, config.room)
     others = _obstacles(perception, (name,), contacts, lowest, config)
     for share in (0.5, 0.2):
-        between = _raised(contacts - share * distance * ahead, lowest)
-        hit |= _meets(others, between, hands, config.body[:1], 0.0)
+        free = ~hit
+        between = _raised(contacts[free] - share * distance * ahead[free], lowest)
+        hit[free] = _meets(others, between, hands[free], config.body[:1], 0.0)
     reach = config.reach - config.slanted_reach * max(np.sin(slant), 0.0)
     return ~hit & (np.linalg.norm((begin - perception.base)[:, :2], axis=1) < reach)
 
@@ -309,11 +310,15 @@ def _meets(
     room: float,
 ) -> np.ndarray:
     """Whether points [N, 3] lie in one of a hand's boxes, or nearer to it than ``room``, for each hand, bool [M]."""
-    local = np.einsum("nmk,nkj->nmj", points[None] - at[:, None], hands)
-    hit = np.zeros(local.shape[:2], bool)
+    local = hands.swapaxes(1, 2) @ (points.T[None] - at[..., None])  # [M, 3, N], the hands' axes second
+    hit = np.zeros(len(at), bool)
     for low, high in boxes:
-        hit |= ((local > np.array(low) - room) & (local < np.array(high) + room)).all(axis=2)
-    return np.asarray(hit.any(axis=1))
+        inside = np.ones((len(at), len(points)), bool)
+        for axis in range(3):
+            along = local[:, axis]
+            inside &= (along > low[axis] - room) & (along < high[axis] + room)
+        hit |= inside.any(axis=1)
+    return hit
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:

@@ -343,9 +343,11 @@ def test_an_environment_that_is_told_to_traces_rays() -> None:
     assert isinstance(seen, Egocentric)
     rays = look(tracer(), states)
     for view, camera in enumerate(POLICY_CAMERAS):
-        np.testing.assert_array_equal(seen.images[camera], rays.rgb[:, view])
-        np.testing.assert_array_equal(seen.segmentations[camera], rays.segmentation[:, view])
-        np.testing.assert_array_equal(seen.depths[camera], rays.depth[:, view])
+        # Poses in single precision: a pixel at an edge may differ.
+        same = seen.segmentations[camera] == rays.segmentation[:, view]
+        assert same.mean() > 0.998
+        assert psnr(seen.images[camera], rays.rgb[:, view]) > 40
+        np.testing.assert_allclose(seen.depths[camera][same], rays.depth[:, view][same], rtol=1e-3)
     env.close()
 
 

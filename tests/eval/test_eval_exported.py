@@ -29,7 +29,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def evaluated(folder: Path, *options: str, **environment: str) -> list[dict[str, object]]:
     """Rows of a short evaluation in a process of its own."""
     command = [sys.executable, "-c", "from vecenv.cli import main; main()", "eval", "--suite", SUITE, "--out", folder]
-    command += ["--tasks", "2,7", "--episodes", "[0,3]", "--max-steps", "3", "--policy", "random", *options]
+    command += ["--tasks", "2,7", "--episodes", "0,3", "--max-steps", "3", "--policy", "random", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **environment})
     assert done.returncode == 0, done.stderr
     (file,) = Path(folder).glob("episodes*.jsonl")
