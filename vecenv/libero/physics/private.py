@@ -1,10 +1,10 @@
 """The private modules of MJX and MuJoCo Warp that vecenv uses, imported in this file alone.
 
-Out: the names below, for the published contacts (``contacts.py`` and the Warp colliders), for the order of contacts
-and sums (``deterministic.py``) and for the ray tracer (``vecenv.libero.render``). MJX gives no promise about them: they
-were read in the version ``TESTED``. The names of MuJoCo Warp exist only where ``warp`` is installed. Asking for one that
-is missing raises an ``ImportError`` that names the installed and the tested version. What the functions look like is
-checked by their users, which know what they replace: ``contacts.py`` and ``deterministic.py`` check signatures,
+Out: the names below, for the published contacts (``contacts.py`` and the Warp colliders), for the order of contacts and
+sums (``deterministic.py``) and for the ray tracer (``vecenv.libero.render``). MJX gives no promise about them: they
+were read in the version ``TESTED``. The names of MuJoCo Warp exist only where ``warp`` is installed. Asking for one
+that is missing raises an ``ImportError`` that names the installed and the tested version. What the functions look like
+is checked by their users, which know what they replace: ``contacts.py`` and ``deterministic.py`` check signatures,
 ``vecenv.libero.render.ray_kernel`` the kernel's arguments.
 """
 

@@ -34,7 +34,7 @@ import copy
 import functools
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -44,11 +44,9 @@ from mujoco import mjx
 from vecenv.errors import SimulationError
 from vecenv.libero.physics import private
 from vecenv.libero.physics.mjx import deterministic_warp as kernels
-from vecenv.libero.physics.mjx.options import MjxError
+from vecenv.libero.physics.mjx.options import DETERMINISTIC, MjxError, is_deterministic
 from vecenv.libero.physics.mjx.patching import copy_with, dispatch, expect
 
-# The bit of a Warp model's disable flags that selects deterministic steps.
-DETERMINISTIC = 1 << 29
 # A launch has about this many groups of threads for the rows of all worlds, at least and at most so many a world.
 _GROUPS, _FEWEST_SLOTS, _MOST_SLOTS = 65536, 8, 128
 _LOCK = threading.Lock()
@@ -112,10 +110,6 @@ def marked(model: mjx.Model) -> mjx.Model:
     return model.replace(opt=model.opt.replace(disableflags=model.opt.disableflags | DETERMINISTIC))
 
 
-def _is_marked(model: Any) -> bool:
-    return bool(int(model.opt.disableflags) & DETERMINISTIC)
-
-
 @functools.cache
 def install() -> None:
     """Make MuJoCo Warp step marked models deterministically; done once a process.
@@ -130,10 +124,10 @@ def install() -> None:
             raise _unsupported(f"a module, type or function of MuJoCo Warp is missing ({error})") from error
         for module, functions in variants:
             for name, function in functions.items():
-                setattr(module, name, dispatch(function, getattr(module, name), _is_marked))
+                setattr(module, name, dispatch(function, getattr(module, name), is_deterministic))
 
 
-_Variants = tuple[Any, Mapping[str, Callable[..., Any]]]
+_Variants: TypeAlias = tuple[Any, Mapping[str, Callable[..., Any]]]
 _expect = functools.partial(expect, unsupported=_unsupported)
 
 
@@ -301,9 +295,7 @@ def _add_forces(m: Any, d: Any, ctx: Any) -> None:
         inputs=[*_groups(d), d.efc.force, ctx.done, slots],
         outputs=[ctx.force_sums, d.qfrc_constraint],
     )
-    wp.launch(
-        kernels.read_forces, dim=(d.nworld, m.nv), inputs=[ctx.done], outputs=[ctx.force_sums, d.qfrc_constraint]
-    )
+    wp.launch(kernels.read_forces, dim=(d.nworld, m.nv), inputs=[ctx.done], outputs=[ctx.force_sums, d.qfrc_constraint])
 
 
 def _add_hessian(m: Any, d: Any, ctx: Any) -> None:

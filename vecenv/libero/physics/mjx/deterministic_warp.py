@@ -15,7 +15,8 @@ an influence.
 """
 
 # In Warp, int(0) makes a variable that a loop may change; a literal is a constant.
-# ruff: noqa: RUF046, UP018
+# A loop with return is Warp's; all() is not.
+# ruff: noqa: RUF046, SIM110, UP018
 # The bodies are Warp's language, whose overloads pyright does not know.
 # pyright: basic, reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportReturnType=false, reportAttributeAccessIssue=false
@@ -151,7 +152,7 @@ def read_rows(
     names: wp.array2d[wp.vec3i],
     values: wp.array3d[float],
 ):
-    """Copy each row to its rank: type, id and column to ``names`` [nworld, n], the rest to ``values`` [nworld, n, 7]."""
+    """Copy each row to its rank: type, id and column to ``names`` [nworld, n], others to ``values`` [nworld, n, 7]."""
     world, row = wp.tid()
     count = wp.min(nefc[world], njmax)
     if row >= count:

@@ -15,9 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-def expect(
-    function: Any, arguments: str, *names: str, unsupported: Callable[[str], Exception]
-) -> types.FunctionType:
+def expect(function: Any, arguments: str, *names: str, unsupported: Callable[[str], Exception]) -> types.FunctionType:
     """The undecorated function, checked to take these arguments first and to refer to these global names.
 
     Args:
