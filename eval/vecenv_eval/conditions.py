@@ -33,7 +33,8 @@ def conditions(env: BatchEnv, config: EvalConfig) -> dict[str, Any]:
     Returns:
         Plain types: ``protocol``; ``instead``, options that are not the protocol's, name -> [the protocol's, the one in
         use]; ``horizon`` in ticks, ``idle_steps``, ``start``, ``contacts``, ``colors``, ``fixtures``, ``reset_loop``
-        (of upstream's fixtures), ``seed`` and ``success``. ``"-"`` stands where the suite has no such choice.
+        (of upstream's fixtures), ``seed`` and ``success``; and ``deterministic``, True, where that was asked for.
+        ``"-"`` stands where the suite has no such choice.
     """
     chosen = protocols.protocol(config.protocol, family(config.suite))
     options = {name: getattr(getattr(env, "config", None), name, None) for name in chosen.options(config.suite)}
@@ -54,6 +55,7 @@ def conditions(env: BatchEnv, config: EvalConfig) -> dict[str, Any]:
         "reset_loop": asdict(protocols.reset_loop(used["reset_loop"])) if upstream else NONE,
         "seed": used["seed"],
         "success": used["success"],
+        **({"deterministic": True} if _of(env, "deterministic") is True else {}),
     }
 
 
@@ -96,6 +98,7 @@ def describe(conditions: Mapping[str, Any]) -> str:
         "fixtures": conditions["fixtures"],
         "seed": conditions["seed"],
     }
+    parts |= {"deterministic": "yes"} if conditions.get("deterministic") else {}
     parts |= {name: conditions[name] for name in INDIFFERENT if name in conditions}
     return "; ".join(f"{name} {value}" for name, value in parts.items()) + "."
 

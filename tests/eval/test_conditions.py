@@ -106,3 +106,11 @@ def test_both_verdicts_are_reported_where_they_differ() -> None:
     assert "The goal held at some tick in 2 and at the last tick in 1 of them." in markdown(summary)
     same = summarise(records[:1], [records[0].key], suite="s", policy="p", instructions=["i"])
     assert "The goal held" not in markdown(same)
+
+
+def test_deterministic_steps_are_named_only_where_they_were_asked_for() -> None:
+    config = EvalConfig(suite="libero_10")
+    assert "deterministic" not in of(config)
+    found = of(config, deterministic=True)
+    assert found["deterministic"] is True
+    assert describe(found).endswith("; deterministic yes.")

@@ -61,6 +61,10 @@ class LiberoConfig:
             (``vecenv.libero.scene.lean.geometry``).
         contacts: ``"published"``, those of MuJoCo 2.3 to 3.3, under which LIBERO's data and checkpoints were made and
             scored, or ``"current"``, those of the installed MuJoCo (``vecenv.libero.scene.contacts``).
+        deterministic: with ``backend="warp"``, bit-identical results whenever the same episodes are run with the same
+            actions on the same kind of GPU, in any slots of a batch (``vecenv.libero.physics.mjx.deterministic``);
+            without it two runs differ by rounding, which contacts enlarge. Native results are always the same, so
+            there it changes nothing; ``"jax"`` does not have it.
         budget: contact and constraint memory on MJX; None measures each scene once and remembers it.
         fixtures: where fixtures stand, which init states do not say: ``"center"`` of their BDDL region, ``"sampled"``
             from it (a function of seed, suite, task and episode), ``"upstream"``, as upstream draws them in
@@ -96,6 +100,7 @@ class LiberoConfig:
     backend: str = "native"
     geometry: str = "exact"
     contacts: Contacts = "published"
+    deterministic: bool = False
     budget: Budget | None = None
     fixtures: str | Mapping[str, Any] | None = None
     start: str | None = None
@@ -125,6 +130,8 @@ class LiberoConfig:
             value = getattr(self, name)
             if value not in allowed and not (value is None and name in _DECIDED_BY_PROTOCOL):
                 raise LiberoError(f"{name}={value!r} is not available; available: {', '.join(allowed)}")
+        if self.deterministic and self.backend == "jax":
+            raise LiberoError("deterministic=True is for backend='warp', and 'native' has it anyway; 'jax' does not")
         if self.reset_loop is not None:
             object.__setattr__(self, "reset_loop", reset_loop(self.reset_loop))
         if isinstance(self.render, Mapping):

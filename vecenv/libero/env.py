@@ -111,6 +111,7 @@ class LiberoEnv(SlotBatch):
                 geometry=self.config.geometry,
                 num_threads=self.config.num_threads,
                 num_devices=self.config.num_devices,
+                deterministic=self.config.deterministic,
                 budgets=[self._budget_of(key, scene) for key, scene in zip(keys, scenes, strict=True)],
             )
         self._physics.set_goals([self._goal_table(group) for group in self._physics.groups])

@@ -17,8 +17,8 @@ MAX_SETTLE_STEPS = 1_000
 # The options of ``vecenv.make`` that decide where an episode begins and how it goes; no path is among them.
 _OPTIONS = frozenset(
     {
-        *("backend", "geometry", "contacts", "fixtures", "reset_loop", "start", "settle_steps", "max_steps"),
-        *("success", "seed"),
+        *("backend", "geometry", "contacts", "deterministic", "fixtures", "reset_loop", "start", "settle_steps"),
+        *("max_steps", "success", "seed"),
     }
 )
 _SIMPLER_OPTIONS = frozenset({"backend", "gripper", "max_steps", "success", "variant", "protocol"})

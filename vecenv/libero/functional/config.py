@@ -36,6 +36,8 @@ class FunctionalConfig:
         impl: ``"warp"``, ``"jax"``, or None: warp where JAX runs on CUDA and jax elsewhere.
         geometry: ``"exact"``, upstream's collision geoms, or ``"lean"``, at most 24 fitted ones.
         contacts: ``"published"``, those of the MuJoCo that LIBERO comes from, or ``"current"``.
+        deterministic: with ``impl="warp"``, results that do not depend on the order in which threads run
+            (``vecenv.libero.physics.mjx.deterministic``); needs elliptic cones.
         scenes: a folder that ``vecenv compile`` wrote, in place of the installed packages.
         budget: contact and constraint memory of a world; None measures the scene once and remembers it.
         iterations: solver iterations and line-search steps a substep at most; None for those of ``vecenv.make``.
@@ -69,6 +71,7 @@ class FunctionalConfig:
     impl: str | None = None
     geometry: str = "exact"
     contacts: Contacts = "published"
+    deterministic: bool = False
     scenes: str | None = None
     budget: Budget | None = None
     iterations: tuple[int, int] | None = None
@@ -105,6 +108,10 @@ class FunctionalConfig:
         for name in self.observed:
             if name not in OBSERVATIONS:
                 raise FunctionalError(f"obs={name!r}: expected some of {', '.join(OBSERVATIONS)}")
+        if self.deterministic and (self.impl == "jax" or self.cone != "elliptic"):
+            raise FunctionalError(
+                f"deterministic=True with impl={self.impl!r} and cone={self.cone!r}: it needs 'warp' and 'elliptic'"
+            )
         if not 1 <= self.image_size <= LARGEST_SIDE:
             raise FunctionalError(f"image_size={self.image_size}: expected 1 to {LARGEST_SIDE}")
         if not 0 < self.action_scale <= 1:

@@ -89,7 +89,13 @@ class FunctionalLibero:
         self.scene = _with_cone(_scene(source, sharing, self.config), CONES[self.config.cone])
         budget = self.config.budget or episode_starts.measured_budget(self.scene, sharing)
         iterations = self.config.iterations or mjx_model.usual_iterations(self.config.impl, self.config.geometry)
-        built = mjx_model.build(self.scene, impl=self.config.impl, budget=budget, iterations=iterations)
+        built = mjx_model.build(
+            self.scene,
+            impl=self.config.impl,
+            budget=budget,
+            iterations=iterations,
+            deterministic=self.config.deterministic,
+        )
         self.impl, self.budget = built.impl, budget
         self._physics = WorldPhysics(built, self.config.action)
         # Playground's wrapper for domain randomisation puts another model here while it traces.

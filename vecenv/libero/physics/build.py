@@ -21,6 +21,7 @@ def make_physics(
     geometry: str = "exact",
     num_threads: int | None,
     num_devices: int = 1,
+    deterministic: bool = False,
     budgets: Sequence[Budget | None],
 ) -> Physics:
     """The physics of a batch.
@@ -32,10 +33,11 @@ def make_physics(
         geometry: profile of the scenes' collision geoms; MJX solves lean ones with fewer iterations.
         num_threads: threads of the native backend; None for one a core.
         num_devices: devices that MJX spreads the slots over.
+        deterministic: with warp, results that do not depend on the order of threads; the native backend's never do.
         budgets: memory of each scene on MJX; not read by the native backend.
 
     Raises:
-        ValueError: a backend that does not exist or is not installed.
+        ValueError: a backend that does not exist or is not installed, or ``deterministic`` in pure JAX.
     """
     # Each backend is imported when it is used: MJX takes two seconds, and the native one brings numba.
     if backend == "native":
@@ -52,5 +54,6 @@ def make_physics(
     for scene, budget in zip(scenes, budgets, strict=True):
         if budget is None:
             raise ValueError(f"backend {backend!r} needs a budget for each scene")
-        builds.append(build(scene, impl=impl, budget=budget, iterations=usual_iterations(impl, geometry)))
+        iterations = usual_iterations(impl, geometry)
+        builds.append(build(scene, impl=impl, budget=budget, iterations=iterations, deterministic=deterministic))
     return MjxPhysics(builds, scene_of_slot, num_devices)

@@ -1,10 +1,11 @@
 """The private modules of MJX and MuJoCo Warp that vecenv uses, imported in this file alone.
 
-Out: the names below, for the published contacts (``contacts.py`` and the Warp colliders) and for the ray tracer
-(``vecenv.libero.render``). MJX gives no promise about them: they were read in the version ``TESTED``. The names of
-MuJoCo Warp exist only where ``warp`` is installed. Asking for one that is missing raises an ``ImportError`` that names
-the installed and the tested version. What the functions look like is checked by their users, which know what they
-replace: ``contacts.py`` checks signatures, ``vecenv.libero.render.ray_kernel`` the kernel's arguments.
+Out: the names below, for the published contacts (``contacts.py`` and the Warp colliders), for the order of contacts and
+sums (``deterministic.py``) and for the ray tracer (``vecenv.libero.render``). MJX gives no promise about them: they
+were read in the version ``TESTED``. The names of MuJoCo Warp exist only where ``warp`` is installed. Asking for one
+that is missing raises an ``ImportError`` that names the installed and the tested version. What the functions look like
+is checked by their users, which know what they replace: ``contacts.py`` and ``deterministic.py`` check signatures,
+``vecenv.libero.render.ray_kernel`` the kernel's arguments.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ _missing: ImportError | None = None
 try:
     from mujoco.mjx.third_party.mujoco_warp._src import collision_driver as warp_collision_driver
     from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive as warp_collision_primitive
+    from mujoco.mjx.third_party.mujoco_warp._src import constraint as warp_constraint
     from mujoco.mjx.third_party.mujoco_warp._src import render as warp_render
+    from mujoco.mjx.third_party.mujoco_warp._src import smooth as warp_smooth
+    from mujoco.mjx.third_party.mujoco_warp._src import solver as warp_solver
     from mujoco.mjx.third_party.mujoco_warp._src.collision_core import Geom
     from mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core import mat83f, vec8f
     from mujoco.mjx.third_party.mujoco_warp._src.ray import ray_capsule, ray_cylinder, ray_ellipsoid, ray_sphere
     from mujoco.mjx.third_party.mujoco_warp._src.render_util import pack_rgba_to_uint32
-    from mujoco.mjx.third_party.mujoco_warp._src.types import mat43
+    from mujoco.mjx.third_party.mujoco_warp._src.types import ConstraintState, ContactType, mat43, vec5, vec10
     from mujoco.mjx.third_party.mujoco_warp._src.warp_util import event_scope
     from mujoco.mjx.warp import render_context
 except ImportError as error:
@@ -34,6 +38,8 @@ TESTED = "3.17"
 
 __all__ = [
     "TESTED",
+    "ConstraintState",
+    "ContactType",
     "Geom",
     "event_scope",
     "installed_version",
@@ -46,10 +52,15 @@ __all__ = [
     "ray_ellipsoid",
     "ray_sphere",
     "render_context",
+    "vec5",
     "vec8f",
+    "vec10",
     "warp_collision_driver",
     "warp_collision_primitive",
+    "warp_constraint",
     "warp_render",
+    "warp_smooth",
+    "warp_solver",
 ]
 
 

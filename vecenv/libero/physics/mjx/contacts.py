@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import copy
 import functools
-import inspect
 import threading
-import types
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +24,7 @@ from mujoco import mjx
 from vecenv.errors import SimulationError
 from vecenv.libero.physics import private
 from vecenv.libero.physics.colliders import boxbox_jax, planemesh_jax
+from vecenv.libero.physics.mjx.patching import copy_with, dispatch, expect
 from vecenv.libero.physics.private import jax_collision_driver
 from vecenv.libero.scene.contacts import MARK, MESH_MARGIN
 
@@ -81,40 +80,7 @@ def _unsupported(found: str) -> MjxContactsError:
     )
 
 
-def _expect(function: Any, arguments: str, *names: str) -> types.FunctionType:
-    """The undecorated function, checked to take these arguments first and to refer to these global names.
-
-    Raises:
-        MjxContactsError: it does not.
-    """
-    plain = inspect.unwrap(getattr(function, "func", function))
-    name = f"{getattr(plain, '__module__', '?')}.{getattr(plain, '__qualname__', plain)}"
-    if not isinstance(plain, types.FunctionType):
-        raise _unsupported(f"{name} is not a function")
-    found = list(inspect.signature(plain).parameters)
-    if found[: len(arguments.split())] != arguments.split():
-        raise _unsupported(f"{name} takes {', '.join(found)}")
-    if missing := set(names) - set(plain.__code__.co_names):
-        raise _unsupported(f"{name} does not refer to {', '.join(sorted(missing))}")
-    return plain
-
-
-def _copy_with(function: types.FunctionType, name: str, **replaced: object) -> types.FunctionType:
-    """A copy of a function in which some of its global names have other values."""
-    copied = types.FunctionType(function.__code__, {**function.__globals__, **replaced}, name, function.__defaults__)
-    copied.__annotations__, copied.__doc__ = dict(function.__annotations__), function.__doc__
-    copied.__module__, copied.__qualname__ = __name__, name
-    return copied
-
-
-def _dispatch(published: Callable[..., Any], current: Callable[..., Any], is_marked: Callable[[Any], bool]) -> Any:
-    """A function of a model that calls ``published`` if the model is marked, else ``current``."""
-
-    @functools.wraps(current)
-    def chosen(model: object, *args: object, **kwargs: object) -> Any:
-        return (published if is_marked(model) else current)(model, *args, **kwargs)
-
-    return chosen
+_expect = functools.partial(expect, unsupported=_unsupported)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -131,7 +97,7 @@ def install_warp() -> None:
     driver = _warp_driver()
     with _LOCK:
         published, current = _warp_narrowphase(), driver.primitive_narrowphase
-        driver.primitive_narrowphase = _dispatch(published, current, _has_bit)
+        driver.primitive_narrowphase = dispatch(published, current, _has_bit)
 
 
 def _warp_driver() -> Any:
@@ -157,7 +123,7 @@ def _warp_narrowphase() -> Callable[..., Any]:
     _expect(getattr(driver, "_narrowphase", None), "m d ctx", "primitive_narrowphase", "NATIVECCD", "PRIMITIVE")
     current = getattr(driver, "primitive_narrowphase", None)
     plain = _expect(current, "m d ctx collision_table", "_PRIMITIVE_COLLISIONS", "_primitive_narrowphase")
-    return private.event_scope(_copy_with(plain, "published_narrowphase", _PRIMITIVE_COLLISIONS=_warp_colliders()))
+    return private.event_scope(copy_with(plain, "published_narrowphase", _PRIMITIVE_COLLISIONS=_warp_colliders()))
 
 
 def _warp_colliders() -> dict[Any, Any]:
@@ -179,7 +145,7 @@ def _warp_colliders() -> dict[Any, Any]:
     for kinds, (name, arguments, replacement) in ours.items():
         _expect(getattr(primitive, name, None), arguments)
         wrapper = _expect(table.get(kinds), "naconmax_in", name)
-        table[kinds] = wp.func(_copy_with(wrapper, f"published_{name}", **{name: replacement}))
+        table[kinds] = wp.func(copy_with(wrapper, f"published_{name}", **{name: replacement}))
     return table
 
 
@@ -196,7 +162,7 @@ def install_jax() -> None:
     """
     with _LOCK:
         for name, published in _jax_functions().items():
-            setattr(jax_collision_driver, name, _dispatch(published, getattr(jax_collision_driver, name), _is_marked))
+            setattr(jax_collision_driver, name, dispatch(published, getattr(jax_collision_driver, name), _is_marked))
         mjx.collision = jax_collision_driver.collision
 
 
@@ -212,5 +178,5 @@ def _jax_functions() -> dict[str, Callable[..., Any]]:
     found = {}
     for name, arguments in (("collision", "m d"), ("make_condim", "m impl")):
         plain = _expect(getattr(jax_collision_driver, name, None), arguments, "_COLLISION_FUNC")
-        found[name] = _copy_with(plain, f"published_{name}", _COLLISION_FUNC=table)
+        found[name] = copy_with(plain, f"published_{name}", _COLLISION_FUNC=table)
     return found

@@ -7,6 +7,7 @@ the controller, and blank data for a batch of worlds.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import NamedTuple
 
 import jax
@@ -82,7 +83,12 @@ def usual_iterations(impl: str | None, geometry: str) -> tuple[int, int]:
 
 
 def build(
-    scene: Scene, *, impl: str | None = None, budget: budgets.Budget, iterations: tuple[int, int] | None = None
+    scene: Scene,
+    *,
+    impl: str | None = None,
+    budget: budgets.Budget,
+    iterations: tuple[int, int] | None = None,
+    deterministic: bool = False,
 ) -> Build:
     """Put a scene's model on the device.
 
@@ -91,12 +97,18 @@ def build(
         impl: ``"jax"``, ``"warp"`` or None, see ``resolve_impl``.
         budget: sizes of the contact and constraint memory.
         iterations: solver iterations and line-search steps at most; None for ``usual_iterations`` of exact geometry.
+        deterministic: with warp, steps whose results do not depend on the order in which threads run, see
+            ``vecenv.libero.physics.mjx.deterministic``.
 
     Raises:
-        MjxError: see ``resolve_impl``; or the integrator is not Euler; or the arm's joints are not the first.
+        MjxError: see ``resolve_impl``; or the integrator is not Euler; or the arm's joints are not the first; or
+            ``deterministic`` with jax, or for a scene with something it does not support.
         MjxContactsError: the scene has published contacts, and the installed MJX does not support them.
+        MjxDeterminismError: ``deterministic``, and the installed MJX does not support it.
     """
     chosen = resolve_impl(impl)
+    if deterministic and chosen != "warp":
+        raise MjxError("deterministic=True is for MuJoCo Warp and native MuJoCo; here MJX runs in pure JAX")
     remember_compilations()
     if [*scene.arm_qpos, *scene.finger_qpos] != list(range(ROBOT_JOINTS)):
         raise MjxError("the arm and its fingers must be the scene's first joints")
@@ -107,13 +119,30 @@ def build(
     # Single precision never reaches the tolerance that published contacts set for native physics.
     model.opt.tolerance, model.opt.ls_tolerance = (contacts.OPTIONS["current"][name] for name in _TOLERANCES)
     touching = _without_contact_sensors(model) if chosen == "jax" else None
+    if deterministic:
+        model = _deterministic().prepared(model)
     put = mjx_contacts.put_model(model, impl=chosen)
+    if deterministic:
+        put = _deterministic().marked(put)
     if chosen == "warp":
         put = put.replace(opt=put.opt.tree_replace({"_impl.warn_overflow": 0}))
     chain = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), panda_chain(scene.model))
     home_qpos = jnp.array([*HOME_QPOS, 0.0, 0.0], jnp.result_type(float))
     home = jax.jit(kinematics.arm_state)(chain, home_qpos, jnp.zeros_like(home_qpos))
     return Build(scene=scene, model=model, impl=chosen, budget=budget, system=System(put, chain, home, touching))
+
+
+def _deterministic() -> ModuleType:
+    """The module, which needs Warp.
+
+    Raises:
+        MjxError: the installed MuJoCo Warp lacks a name that the module needs.
+    """
+    try:
+        from vecenv.libero.physics.mjx import deterministic
+    except ImportError as error:
+        raise MjxError(f"deterministic=True: {error}") from error
+    return deterministic
 
 
 def _without_contact_sensors(model: mujoco.MjModel) -> jax.Array:

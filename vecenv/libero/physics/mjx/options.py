@@ -18,6 +18,8 @@ from vecenv.errors import InvalidInput
 from vecenv.util import caching
 
 Impl: TypeAlias = Literal["jax", "warp"]
+# The bit of a Warp model's disable flags, which MuJoCo does not use, that selects deterministic steps.
+DETERMINISTIC = 1 << 29
 
 
 class MjxError(InvalidInput):
@@ -38,6 +40,11 @@ def resolve_impl(impl: str | None = None) -> Impl:
     if impl == "warp" and not _has_warp():
         raise MjxError("backend 'warp' needs MuJoCo Warp: pip install 'vecenv[warp]'")
     return "warp" if impl == "warp" else "jax"
+
+
+def is_deterministic(model: Any) -> bool:
+    """Whether an MJX model, or one of MuJoCo Warp, is stepped deterministically, see ``deterministic``."""
+    return bool(int(model.opt.disableflags) & DETERMINISTIC)
 
 
 def _has_warp() -> bool:

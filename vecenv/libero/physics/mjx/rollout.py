@@ -6,14 +6,18 @@ took and whether its goal held. Worlds stop one by one; a loop ends when none mo
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from vecenv.controllers import waypoint
+from vecenv.libero.physics.mjx.blocks import by_blocks
 from vecenv.libero.physics.mjx.model import System
+from vecenv.libero.physics.mjx.options import is_deterministic
 from vecenv.libero.physics.mjx.step import World, control_step, eef, judge
 from vecenv.libero.scene import goals
 
@@ -47,7 +51,8 @@ def _tick(
 ) -> Loop:
     worlds = jax.vmap(control_step, in_axes=(None, 0, 0, 0))(system, loop.worlds, actions, moved)
     healthy = worlds.fault == 0
-    success = jnp.where(moved, jax.vmap(judge)(worlds, table) & healthy, loop.success)
+    held = jax.vmap(judge, in_axes=(None, 0, 0))(system, worlds, table)
+    success = jnp.where(moved, held & healthy, loop.success)
     solved, ticks = loop.solved | success, loop.ticks + moved
     going = loop.going & healthy & (ticks < limit)
     return Loop(worlds, going & ~solved if until_success else going, ticks, success, solved)
@@ -81,6 +86,13 @@ def run_chunk(
         return _tick(system, table, limit, loop, chunk[:, k], loop.going, until_success), k + 1
 
     return lax.while_loop(running, body, (_begin(worlds, active, limit), jnp.zeros((), jnp.int32)))[0]
+
+
+def _batched(system: System, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of batches, [n, ...], which treats every world alike; computed by blocks if deterministic."""
+    if not is_deterministic(system.model):
+        return function
+    return lambda *rows: by_blocks(lambda _, rows: function(*rows), (), rows)
 
 
 class Trace(NamedTuple):
@@ -121,6 +133,8 @@ def follow_plan(
     """
     current = eef(worlds, *sites)
     progress = waypoint.begin_plan(plan, current)
+    act = _batched(system, partial(waypoint.plan_action, config=config))
+    advance = _batched(system, partial(waypoint.plan_advance, config=config))
     trace = Trace(jnp.zeros((*active.shape, traced, 7)), jnp.zeros((*active.shape, traced), bool))
 
     def moving(loop: Loop, progress: waypoint.Progress) -> jax.Array:
@@ -131,9 +145,9 @@ def follow_plan(
     ) -> tuple[Loop, waypoint.Progress, Trace, jax.Array]:
         loop, progress, trace, count = carry
         moved = moving(loop, progress)
-        actions, progress = waypoint.plan_action(plan, progress, eef(loop.worlds, *sites), config)
+        actions, progress = act(plan, progress, eef(loop.worlds, *sites))
         loop = _tick(system, table, limit, loop, actions, moved, until_success)
-        progress = waypoint.plan_advance(plan, progress, eef(loop.worlds, *sites), moved, config)
+        progress = advance(plan, progress, eef(loop.worlds, *sites), moved)
         if traced:
             trace = Trace(trace.actions.at[:, count].set(actions), trace.moved.at[:, count].set(moved))
         return loop, progress, trace, count + 1

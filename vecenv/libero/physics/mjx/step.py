@@ -9,7 +9,7 @@ contacts at the start of the last substep, proprioception is the sample of the 2
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,9 @@ from vecenv.controllers import gripper as gripper_control
 from vecenv.controllers import kinematics, osc, waypoint
 from vecenv.libero.physics import newton
 from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS
+from vecenv.libero.physics.mjx.blocks import for_worlds
 from vecenv.libero.physics.mjx.model import ROBOT_JOINTS, System
+from vecenv.libero.physics.mjx.options import is_deterministic
 from vecenv.libero.scene import goals
 from vecenv.util.rotations import quat_to_mat
 
@@ -173,13 +175,22 @@ def _placed(system: System, world: World) -> mjx.Data:
     model = system.model
     body = np.asarray(model.geom_bodyid)
     fixed = (np.asarray(model.body_weldid)[body] == 0)[:, None]
-    turned = data.xmat.reshape(-1, 3, 3)[body]
-    own = jax.vmap(quat_to_mat)(model.geom_quat)
-    pos = data.xpos[body] + (turned * model.geom_pos[:, None]).sum(-1)
-    mat = (turned[..., None] * own[:, None]).sum(-2)
+    carried = for_worlds(_carried, is_deterministic(model))
+    pose = data.xpos[body], data.xmat.reshape(-1, 3, 3)[body]
+    pos, mat = carried((model.geom_pos, model.geom_quat), pose)
     xpos = jnp.where(fixed, pos, data.geom_xpos)
     xmat = jnp.where(fixed[..., None], mat, data.geom_xmat.reshape(-1, 3, 3)).reshape(data.geom_xmat.shape)
     return forward(system, world._replace(data=data.replace(geom_xpos=xpos, geom_xmat=xmat)))
+
+
+_Pose: TypeAlias = tuple[jax.Array, jax.Array]
+
+
+def _carried(geoms: _Pose, bodies: _Pose) -> _Pose:
+    """Positions [ngeom, 3] and rotations [ngeom, 3, 3] of geoms, from those in their bodies and of the bodies."""
+    pos, turned = bodies
+    own = jax.vmap(quat_to_mat)(geoms[1])
+    return pos + (turned * geoms[0][:, None]).sum(-1), (turned[..., None] * own[:, None]).sum(-2)
 
 
 def _own_model(system: System, world: World) -> mjx.Model:
@@ -189,7 +200,7 @@ def _own_model(system: System, world: World) -> mjx.Model:
 def observe(system: System, world: World) -> World:
     """The world with its proprioception taken from the current state."""
     robot = world.data.qpos[:ROBOT_JOINTS]
-    pos, quat = kinematics.hand_pose(system.chain, robot)
+    pos, quat = for_worlds(kinematics.hand_pose, is_deterministic(system.model))(system.chain, robot)
     return world._replace(eef_pos=pos, eef_quat=quat, fingers=robot[7:], seen_qpos=world.data.qpos)
 
 
@@ -213,16 +224,14 @@ def control_step(system: System, world: World, action: jax.Array, active: ArrayL
 def _control_step(system: System, world: World, action: jax.Array, active: jax.Array) -> World:
     model = _own_model(system, world)
     goal = _new_goal(system, world, action)
+    commands = for_worlds(_commands, is_deterministic(system.model))
 
     def advance(carry: _Carry, index: jax.Array) -> tuple[_Carry, tuple[jax.Array, ...]]:
         data, fingers, fault = carry
         robot, speed = data.qpos[:ROBOT_JOINTS], data.qvel[:ROBOT_JOINTS]
-        arm = kinematics.arm_state(system.chain, robot, speed)
-        seen = (*kinematics.hand_pose(system.chain, robot), robot[7:], data.qpos)
-        seen_by_controller = _as_remembered(system, arm, world.stale & (index == 0))
-        torque = osc.torques(seen_by_controller, goal, system.home.qpos)
-        fingers = gripper_control.integrate(fingers, action[6])
-        ctrl = jnp.concatenate([torque, gripper_control.command(fingers)])
+        stale = world.stale & (index == 0)
+        pose, ctrl, fingers = commands((system.chain, system.home), (robot, speed, goal, stale, fingers, action[6]))
+        seen = (*pose, robot[7:], data.qpos)
         data = substep(model, data.replace(ctrl=ctrl.astype(data.ctrl.dtype)))
         return (data, fingers, fault | overflow_bits(data)), seen
 
@@ -244,6 +253,26 @@ def _control_step(system: System, world: World, action: jax.Array, active: jax.A
         lambda new, old: jnp.where(active, new, old), after._replace(data=None), world._replace(data=None)
     )
     return small._replace(data=_keep_state(active, data, world.data))
+
+
+_Arm: TypeAlias = tuple[kinematics.Chain, osc.ArmState]
+
+
+def _commands(shared: _Arm, world: tuple[Any, ...]) -> tuple[_Pose, jax.Array, jax.Array]:
+    """Pose of the hand, controls [9] and finger targets [2] of a substep.
+
+    Args:
+        shared: the arm's constants, and the arm at home.
+        world: joint positions and velocities [9], goal, whether the controller still sees the arm of the reset, finger
+            targets [2], and the gripper's action.
+    """
+    chain, home = shared
+    robot, speed, goal, stale, fingers, grip = world
+    arm = kinematics.arm_state(chain, robot, speed)
+    torque = osc.torques(_as_remembered(home, arm, stale), goal, home.qpos)
+    fingers = gripper_control.integrate(fingers, grip)
+    ctrl = jnp.concatenate([torque, gripper_control.command(fingers)])
+    return kinematics.hand_pose(chain, robot), ctrl, fingers
 
 
 def substep(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -282,13 +311,21 @@ def _keep_state(active: jax.Array, new: mjx.Data, old: mjx.Data) -> mjx.Data:
 
 
 def _new_goal(system: System, world: World, action: jax.Array) -> osc.OscGoal:
-    arm = kinematics.arm_state(system.chain, world.data.qpos[:ROBOT_JOINTS], world.data.qvel[:ROBOT_JOINTS])
-    return osc.set_goal(_as_remembered(system, arm, world.stale), world.goal, action[:6])
+    robot, speed = world.data.qpos[:ROBOT_JOINTS], world.data.qvel[:ROBOT_JOINTS]
+    goal_of = for_worlds(_goal_of, is_deterministic(system.model))
+    return goal_of((system.chain, system.home), (robot, speed, world.stale, world.goal, action[:6]))
 
 
-def _as_remembered(system: System, arm: osc.ArmState, stale: jax.Array) -> osc.ArmState:
+def _goal_of(shared: _Arm, world: tuple[Any, ...]) -> osc.OscGoal:
+    """The goal after an action, from joint positions and velocities [9], ``World.stale``, the goal before, and it."""
+    robot, speed, stale, goal, action = world
+    arm = kinematics.arm_state(shared[0], robot, speed)
+    return osc.set_goal(_as_remembered(shared[1], arm, stale), goal, action)
+
+
+def _as_remembered(home: osc.ArmState, arm: osc.ArmState, stale: jax.Array) -> osc.ArmState:
     """The arm as the controller sees it: while stale, that of the reset, except for the bias torques."""
-    chosen = jax.tree.map(lambda home, now: jnp.where(stale, home, now), system.home, arm)
+    chosen = jax.tree.map(lambda reset, now: jnp.where(stale, reset, now), home, arm)
     return chosen._replace(bias=arm.bias)
 
 
@@ -309,24 +346,23 @@ def is_stable(data: mjx.Data) -> jax.Array:
     return jnp.all(jnp.isfinite(state) & (jnp.abs(state) < _HUGE))
 
 
-def judge(world: World, goal: goals.GoalTable) -> jax.Array:
+def judge(system: System, world: World, goal: goals.GoalTable) -> jax.Array:
     """Whether the goal of one world holds for the kinematics and contacts of the last call, bool.
 
     Args:
+        system: what worlds share.
         world: the world.
         goal: its row of a goal table, without the leading axis.
     """
     data = world.data
-    row = jax.tree.map(lambda x: x[None], goal)
-    return goals.evaluate(
-        row,
-        xpos=data.xpos[None],
-        site_xpos=data.site_xpos[None],
-        site_xmat=data.site_xmat[None],
-        qpos=data.qpos[None],
-        touch=data.sensordata[None],
-        xp=jnp,
-    )[0]
+    seen = {name: getattr(data, name) for name in ("xpos", "site_xpos", "site_xmat", "qpos")}
+    return for_worlds(_holds, is_deterministic(system.model))((), (goal, seen | {"touch": data.sensordata}))
+
+
+def _holds(_: tuple[()], world: tuple[goals.GoalTable, dict[str, jax.Array]]) -> jax.Array:
+    """Whether a goal holds, bool, from its row and what ``goals.evaluate`` sees of one world."""
+    goal, seen = jax.tree.map(lambda x: x[None], world)
+    return goals.evaluate(goal, **seen, xp=jnp)[0]
 
 
 def eef(world: World, grip_site: int, hand_body: int) -> waypoint.Pose:
