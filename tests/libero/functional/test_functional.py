@@ -20,8 +20,6 @@ from vecenv.libero.functional import (
     FunctionalError,
     FunctionalLibero,
     FunctionalState,
-    Randomization,
-    randomize,
 )
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.mjx.options import compiler_options
@@ -318,37 +316,6 @@ def test_unknown_options_and_tasks_are_named() -> None:
         FunctionalLibero("libero_object", task=0, config_overrides={"num_worlds": 3})
     with pytest.raises(UnknownTask, match="0 to 9"):
         FunctionalLibero("libero_object", task=10)
-
-
-# -- domain randomisation ----------------------------------------------------------------------------------------------
-
-
-def test_randomising_varies_each_world_within_the_given_factors() -> None:
-    model = made(reward="shaped").mjx_model
-    config = Randomization(mass=(0.5, 2.0))
-    varied, axes = randomize(model, keys(16), config)
-    factors = np.asarray(varied.body_mass)[:, 1:] / np.maximum(np.asarray(model.body_mass)[1:], 1e-12)
-    heavy = np.asarray(model.body_mass)[1:] > 0
-    assert factors[:, heavy].min() >= 0.5 - 1e-6
-    assert factors[:, heavy].max() <= 2.0 + 1e-6
-    assert len(np.unique(factors[:, heavy][:, 0])) == 16
-    assert axes.body_mass == 0
-    assert axes.body_pos is None
-    wider = jax.tree.map(lambda new, old: 0 if new.ndim > old.ndim else None, varied, model)
-    assert jax.tree.structure(wider) == jax.tree.structure(axes)
-
-
-def test_randomising_by_nothing_changes_nothing() -> None:
-    model = made(reward="shaped").mjx_model
-    same = dict.fromkeys(Randomization.__dataclass_fields__, (1.0, 1.0))
-    varied, _ = randomize(model, keys(3), Randomization(**same))
-    for name in ("geom_friction", "body_mass", "body_inertia", "dof_damping", "actuator_gainprm"):
-        np.testing.assert_allclose(getattr(varied, name)[2], getattr(model, name), rtol=1e-6)
-
-
-def test_randomising_refuses_factors_that_are_none() -> None:
-    with pytest.raises(FunctionalError, match="friction"):
-        Randomization(friction=(0.0, 1.0))
 
 
 def test_the_default_configuration_is_upstreams_task() -> None:

@@ -5,10 +5,11 @@ from vecenv.libero.functional.config import (
     PLACEMENTS,
     FunctionalConfig,
     FunctionalError,
+    Randomization,
     default_config,
 )
 from vecenv.libero.functional.env import FunctionalLibero
-from vecenv.libero.functional.randomize import Randomization, randomize
+from vecenv.libero.functional.randomize import Variation, randomize
 from vecenv.libero.functional.state import Data, FunctionalState
 from vecenv.libero.physics.mjx.options import jit
 
@@ -21,6 +22,7 @@ __all__ = [
     "FunctionalLibero",
     "FunctionalState",
     "Randomization",
+    "Variation",
     "default_config",
     "jit",
     "randomize",

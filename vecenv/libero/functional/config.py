@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ import mujoco
 from vecenv.errors import InvalidInput
 from vecenv.libero.functional.objectives import OBJECTIVES
 from vecenv.libero.physics.budgets import Budget
-from vecenv.libero.render.options import COLORS, LARGEST_SIDE
+from vecenv.libero.render.options import COLORS, LARGEST_SIDE, POLICY_CAMERAS
 from vecenv.libero.scene.contacts import CONTACTS, Contacts
 from vecenv.libero.scene.lean.geometry import PROFILES
 
@@ -26,6 +27,72 @@ PLACEMENTS = ("stored", "regions")
 
 class FunctionalError(InvalidInput):
     """An option that this environment cannot honour; the message says what would be right."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomization:
+    """How much worlds differ, in physics and in images; every draw is uniform.
+
+    As ``FunctionalConfig.randomization`` it is drawn anew at every reset; ``randomize`` draws the physics of a world
+    once and for all. For physics, a quantity has a lower and an upper factor. For images it has the same name, meaning
+    and unit as in ``vecenv.libero.render.options.VisualVariation``, and 0 changes nothing.
+
+    Attributes:
+        friction: sliding friction of all geoms, one factor a world.
+        mass: mass and inertia of each movable object and each link of the robot, a factor each.
+        damping: damping of each joint.
+        armature: rotor inertia of each joint.
+        frictionloss: dry friction of each joint.
+        gripper: strength of the finger actuators (their stiffness and damping), one factor a world.
+        light: the light's scale lies within 1 plus or minus this; at most 1.
+        light_shift: largest shift of the lamps along each axis, metres.
+        color: scales of red, green and blue of each instance lie within 1 plus or minus this; at most 1.
+        camera_pos: largest shift of a camera along each axis of its own frame, metres.
+        camera_turn: largest rotation of a camera about each of these axes, radians; at most pi.
+        cameras: the cameras that move, some of ``"agentview"`` and ``"wrist"``.
+    """
+
+    friction: tuple[float, float] = (0.7, 1.3)
+    mass: tuple[float, float] = (0.8, 1.2)
+    damping: tuple[float, float] = (0.7, 1.3)
+    armature: tuple[float, float] = (0.95, 1.05)
+    frictionloss: tuple[float, float] = (0.7, 1.3)
+    gripper: tuple[float, float] = (0.8, 1.2)
+    light: float = 0.0
+    light_shift: float = 0.0
+    color: float = 0.0
+    camera_pos: float = 0.0
+    camera_turn: float = 0.0
+    cameras: Sequence[str] = ("agentview",)
+
+    def __post_init__(self) -> None:
+        for name in FACTORS:
+            match getattr(self, name):
+                case (float() | int() as low, float() | int() as high) if 0 < low <= high < math.inf:
+                    pass
+                case wrong:
+                    raise FunctionalError(f"{name}={wrong}: expected 0 < lower <= upper factor")
+        for name, most in SPREADS.items():
+            match getattr(self, name):
+                case float() | int() as spread if 0 <= spread <= most and spread < math.inf:
+                    pass
+                case wrong:
+                    bound = "a finite number of at least 0" if most == math.inf else f"a number from 0 to {most:.4g}"
+                    raise FunctionalError(f"{name}={wrong}: expected {bound}")
+        known = not isinstance(self.cameras, str) and set(self.cameras) <= set(POLICY_CAMERAS)
+        moves = self.camera_pos > 0 or self.camera_turn > 0
+        if not known or (moves and not self.cameras):
+            raise FunctionalError(f"cameras={self.cameras!r}: expected some of {', '.join(POLICY_CAMERAS)}")
+
+    @property
+    def visual(self) -> tuple[str, ...]:
+        """Names of the quantities that change images, those that are not 0."""
+        return tuple(name for name in SPREADS if getattr(self, name) > 0)
+
+
+# Quantities of Randomization: factors of physics; and of images, the largest value that each may have.
+FACTORS = ("friction", "mass", "damping", "armature", "frictionloss", "gripper")
+SPREADS = {"light": 1.0, "light_shift": math.inf, "color": 1.0, "camera_pos": math.inf, "camera_turn": math.pi}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +133,8 @@ class FunctionalConfig:
             ``"regions"``, fixtures and objects are also moved to places drawn from their BDDL regions.
         episodes: stored starts to draw from, for example to hold some back for evaluation; None for all 50.
         episode_length: steps after which training wrappers should end an episode; the environment itself counts none.
+        randomization: how much physics and images differ from the published scene, drawn for each episode of each
+            world from the key of its reset; None for not at all.
     """
 
     impl: str | None = None
@@ -90,6 +159,7 @@ class FunctionalConfig:
     placement: str = "stored"
     episodes: tuple[int, ...] | None = None
     episode_length: int = 500
+    randomization: Randomization | None = None
 
     def __post_init__(self) -> None:
         options = {
@@ -122,6 +192,19 @@ class FunctionalConfig:
             raise FunctionalError(
                 f"episode_length={self.episode_length}, reach_distance={self.reach_distance}, "
                 f"lift_height={self.lift_height}: expected >= 1, >= 0 and > 0"
+            )
+        self._check_randomization()
+
+    def _check_randomization(self) -> None:
+        if self.randomization is None:
+            return
+        if not isinstance(self.randomization, Randomization):
+            raise FunctionalError(f"randomization={self.randomization!r}: expected a Randomization, or None")
+        if self.randomization.visual and PIXELS not in self.observed:
+            name = self.randomization.visual[0]
+            raise FunctionalError(
+                f"randomization: {name}={getattr(self.randomization, name)} changes images, and obs={self.obs!r} has "
+                f"none; add {PIXELS!r} to obs or set {name}=0"
             )
 
     @property

@@ -33,12 +33,14 @@ from vecenv.libero.functional.config import (
     PIXELS,
     FunctionalConfig,
     FunctionalError,
+    Randomization,
     default_config,
     overridden,
 )
 from vecenv.libero.functional.objectives import Objective
 from vecenv.libero.functional.observer import Observer
 from vecenv.libero.functional.physics import WorldPhysics
+from vecenv.libero.functional.randomize import Randomizer, Variation
 from vecenv.libero.functional.starts import Starts
 from vecenv.libero.functional.state import FunctionalState
 from vecenv.libero.physics.base import SUBSTEPS
@@ -111,15 +113,17 @@ class FunctionalLibero:
         )
         tracer = _tracer(self.scene, problem, self.config) if PIXELS in self.config.observed else None
         self._observer = Observer(self.scene, self._objective, self.config.observed, tracer)
+        self._randomizer = _randomizer(self.config.randomization, tracer)
         self._source = problem.source
 
     # -- the two functions ---------------------------------------------------------------------------------------------
 
     def reset(self, rng: PRNGKeyArray) -> FunctionalState:
-        """Begin an episode in a start drawn with the key ``rng``."""
+        """Begin an episode in a start drawn with the key ``rng``, and with a variation drawn with it."""
         start = self._starts.stored(rng) if self.config.placement == "stored" else self._starts.regions(rng)
-        data = self._physics.begin(self._mjx_model, start)
-        data = data.replace(start_height=self._objective.height(data.view))
+        variation = None if self._randomizer is None else self._randomizer.episode(self._mjx_model, rng)
+        data = self._physics.begin(self._model(variation), start)
+        data = data.replace(start_height=self._objective.height(data.view), variation=variation)
         zero = jnp.zeros((), jnp.float32)
         return FunctionalState(
             data=data,
@@ -137,7 +141,8 @@ class FunctionalLibero:
             state: what ``reset`` or ``step`` returned.
             action: [action_size]; clipped to [-1, 1]; non-finite values count as 0.
         """
-        data = self._physics.advance(self._mjx_model, state.data, self._prepared(action))
+        model = self._model(state.data.variation)
+        data = self._physics.advance(model, state.data, self._prepared(action))
         before, after = state.data.view, data.view
         fault = data.world.fault != 0
         success = self._objective.success(after) & ~fault
@@ -154,6 +159,11 @@ class FunctionalLibero:
             metrics={**state.metrics, **metrics},
             info={**state.info},
         )
+
+    def _model(self, variation: Variation | None) -> mjx.Model:
+        """The model of a world with this variation."""
+        model = self._mjx_model
+        return model if variation is None else model.tree_replace(variation.fields(model))
 
     def _prepared(self, action: Float[AnyArray, "..."]) -> Float[Array, " action_size"]:
         action = jnp.asarray(action, jnp.result_type(float))
@@ -241,6 +251,12 @@ def _with_cone(scene: Scene, cone: mujoco.mjtCone) -> Scene:
     model = copy.copy(scene.model)
     model.opt.cone = cone
     return dataclasses.replace(scene, model=model)
+
+
+def _randomizer(config: Randomization | None, tracer: RayTracer | None) -> Randomizer | None:
+    if config is None or tracer is None:
+        return None if config is None else Randomizer(config)
+    return Randomizer(config, len(tracer.scenery.instances), [name or "" for name in tracer.cameras])
 
 
 def _tracer(scene: Scene, problem: Problem, config: FunctionalConfig) -> RayTracer:

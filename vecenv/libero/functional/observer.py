@@ -14,11 +14,13 @@ from jaxtyping import Array, Float, Int
 
 from vecenv.libero.functional.config import PIXELS
 from vecenv.libero.functional.objectives import Objective
+from vecenv.libero.functional.randomize import Look
 from vecenv.libero.functional.state import Data
 from vecenv.libero.render.options import POLICY_CAMERAS
-from vecenv.libero.render.raytrace import RayTracer
+from vecenv.libero.render.raytrace import RayTracer, Style
 from vecenv.libero.robot import ARM_DOFS, ROBOT_DOFS
 from vecenv.libero.scene.scene import Scene
+from vecenv.util.rotations import quat_to_mat, rotvec_to_quat
 
 _PROPRIO = {"joint_pos": 7, "joint_vel": 7, "finger_pos": 2, "finger_vel": 2, "eef_pos": 3, "eef_quat": 4}
 
@@ -67,7 +69,9 @@ class Observer:
         if self._tracer is None:
             assert vector is not None
             return vector
-        rgb = self._tracer.look(data.xpos, data.xquat, data.qpos).rgb
+        look = None if data.variation is None else data.variation.look
+        style = None if look is None else _style(self._tracer.plain_style, look)
+        rgb = self._tracer.look(data.xpos, data.xquat, data.qpos, style).rgb
         assert rgb is not None
         views = {f"{PIXELS}/view_{camera}": image / jnp.float32(255) for camera, image in enumerate(rgb)}
         return views if vector is None else {"state": vector, **views}
@@ -85,6 +89,15 @@ class Observer:
     def _objects(self, data: Data) -> list[Float[Array, " _"]]:
         poses = jnp.concatenate([data.xpos[self._bodies], data.xquat[self._bodies]], axis=1)
         return [self._objective.offset(data.view), poses.reshape(-1), data.qpos[self._joints]]
+
+
+def _style(plain: Style, look: Look) -> Style:
+    """The ray tracer's style of a look."""
+    turn = quat_to_mat(rotvec_to_quat(look.camera_turn))
+    ones = jnp.ones(3, jnp.float32)
+    return plain._replace(
+        light=look.light * ones, lamps=look.light_shift, colors=look.color, pos=look.camera_pos, turn=turn
+    )
 
 
 def _fixture_joints(scene: Scene) -> Int[np.ndarray, " J"]:

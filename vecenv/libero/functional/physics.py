@@ -103,7 +103,7 @@ class WorldPhysics:
     def _advance(self, blank: mjx.Data, model: mjx.Model, data: Data, action: Float[Array, " n"]) -> Data:
         full = blank.replace(**{name: getattr(data, name) for name in PHYSICS_FIELDS})
         after = self._act(self._system(model), data.world._replace(data=full), action)
-        return _kept(after).replace(start_height=data.start_height)
+        return _kept(after).replace(start_height=data.start_height, variation=data.variation)
 
 
 def _kept(world: World) -> Data:

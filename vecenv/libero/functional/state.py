@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vecenv.libero.functional.objectives import View
+from vecenv.libero.functional.randomize import Variation
 from vecenv.libero.physics.mjx.step import World
 
 
@@ -34,6 +35,7 @@ class Data:
         world: fixture poses, controller memory, proprioception and faults (``vecenv.libero.physics.mjx.step.World``,
         no ``data``).
         start_height: height of the target's origin when the episode began, metres.
+        variation: how the episode's physics and images differ from the scene's; None without randomisation.
     """
 
     qpos: Float[Array, " nq"]
@@ -50,6 +52,7 @@ class Data:
     sensordata: Float[Array, " nsensordata"]
     world: World
     start_height: Float[Array, ""]
+    variation: Variation | None = None
 
     def replace(self, **changes: Any) -> Data:
         """A copy with some fields replaced."""
@@ -86,7 +89,8 @@ class Data:
 
 
 # Fields that ``mjx.Data`` has too.
-PHYSICS_FIELDS = tuple(field.name for field in dataclasses.fields(Data) if field.name not in ("world", "start_height"))
+_OWN = ("world", "start_height", "variation")
+PHYSICS_FIELDS = tuple(field.name for field in dataclasses.fields(Data) if field.name not in _OWN)
 
 
 @jax.tree_util.register_dataclass
