@@ -22,6 +22,7 @@ try:
     from mujoco.mjx.third_party.mujoco_warp._src.collision_core import Geom
     from mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core import mat83f, vec8f
     from mujoco.mjx.third_party.mujoco_warp._src.ray import ray_capsule, ray_cylinder, ray_ellipsoid, ray_sphere
+    from mujoco.mjx.third_party.mujoco_warp._src.render_util import _build_rays as build_rays
     from mujoco.mjx.third_party.mujoco_warp._src.render_util import pack_rgba_to_uint32
     from mujoco.mjx.third_party.mujoco_warp._src.types import mat43
     from mujoco.mjx.third_party.mujoco_warp._src.warp_util import event_scope
@@ -35,6 +36,7 @@ TESTED = "3.17"
 __all__ = [
     "TESTED",
     "Geom",
+    "build_rays",
     "event_scope",
     "installed_version",
     "jax_collision_driver",
