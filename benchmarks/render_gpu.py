@@ -45,8 +45,8 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for scene, batch in itertools.product(options.scene, options.batch):
         env = environment(scene, options)
-        for size in options.size:
-            rows.append(measure(env, size, batch, options))
+        for size, antialias in itertools.product(options.size, options.antialias):
+            rows.append(measure(env, size, batch, antialias, options))
             print(rows[-1], flush=True)
     report(options.name, rows, title="Ray-traced images: steps a second", notes={"device": str(jax.devices()[0])})
 
@@ -59,6 +59,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--batch", nargs="+", type=int, default=[1024])
     parser.add_argument("--geometry", default="exact", help="collision geoms of the physics")
     parser.add_argument("--samples", type=int, default=1, help="rays a pixel along each side")
+    parser.add_argument("--antialias", nargs="+", choices=("on", "off"), default=["on"], help="of RayTracer")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=2.0, help="of each side a round")
     parser.add_argument("--scenes", help="folder that `vecenv compile` wrote")
@@ -77,10 +78,13 @@ def environment(scene: str, options: argparse.Namespace) -> FunctionalLibero:
     return FunctionalLibero(suite, task=int(task), config=config)
 
 
-def measure(env: FunctionalLibero, size: int, batch: int, options: argparse.Namespace) -> dict[str, Any]:
+def measure(
+    env: FunctionalLibero, size: int, batch: int, antialias: str, options: argparse.Namespace
+) -> dict[str, Any]:
     """One row."""
     scenery = Scenery.load(options.sceneries / f"{env.suite}_{env.task}.npz")
-    tracer = RayTracer(scenery, height=size, width=size, samples=options.samples)
+    rays: dict[str, Any] = {"height": size, "width": size, "samples": options.samples, "antialias": antialias == "on"}
+    tracer = RayTracer(scenery, **rays)
     runs = Loops(env, tracer, batch)
     start = time.perf_counter()
     first = [timed_first(run)[1] for run in (runs.physics, runs.images, runs.both)]
@@ -92,6 +96,7 @@ def measure(env: FunctionalLibero, size: int, batch: int, options: argparse.Name
         "geometry": options.geometry,
         "size": size,
         "B": batch,
+        "antialias": antialias,
         "env steps/s": both,
         "physics alone": physics,
         "images alone": images,
@@ -100,7 +105,7 @@ def measure(env: FunctionalLibero, size: int, batch: int, options: argparse.Name
         "triangles": int(scenery.model.nmeshface),
         "geoms": int(scenery.model.ngeom),
         "MiB on device": round(memory() / 2**20),
-        **(quality(scenery, env.suite, env.task, size, options) if options.references else {}),
+        **(quality(scenery, f"{env.suite}_{env.task}", rays, options) if options.references else {}),
     }
 
 
@@ -162,20 +167,27 @@ class Loops:
         return self._images(self._state, self._actions)[1]
 
 
-def quality(scenery: Scenery, suite: str, task: int, size: int, options: argparse.Namespace) -> dict[str, Any]:
-    """How close the images are to GL's: the lowest and the mean PSNR, dB, and the lowest IoU of an instance's masks."""
-    path = options.references / f"{suite}_{task}_{size}.npz"
+def quality(scenery: Scenery, scene: str, rays: dict[str, Any], options: argparse.Namespace) -> dict[str, Any]:
+    """How close the images are to GL's: the lowest and the mean PSNR, dB, and the lowest IoU of an instance's masks.
+
+    Args:
+        scenery: of the scene.
+        scene: ``suite_task``.
+        rays: options of ``RayTracer``.
+        options: the command line.
+    """
+    path = options.references / f"{scene}_{rays['width']}.npz"
     if not path.exists():
         return {"PSNR min": "-", "PSNR mean": "-", "IoU min": "-"}
     with np.load(path) as file:
         reference = dict(file)
-    tracer = RayTracer(scenery, height=size, width=size, samples=options.samples, segmentation=True)
+    tracer = RayTracer(scenery, **rays, segmentation=True)
     seen = jit(jax.vmap(tracer.look))(reference["xpos"], reference["xquat"], reference["qpos"])
     rgb, seg = np.asarray(seen.rgb), np.asarray(seen.segmentation)
     ratios = [psnr(a, b) for a, b in zip(merged(rgb), merged(reference["rgb"]), strict=True)]
     overlaps = ious(seg, reference["seg"])
     if options.images:
-        save_images(options.images / f"{suite}_{task}_{size}.png", reference["rgb"], rgb)
+        save_images(options.images / f"{path.stem}.png", reference["rgb"], rgb)
     return {
         "PSNR min": round(min(ratios), 1),
         "PSNR mean": round(float(np.mean(ratios)), 1),

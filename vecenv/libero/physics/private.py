@@ -26,6 +26,7 @@ try:
     from mujoco.mjx.third_party.mujoco_warp._src.collision_core import Geom
     from mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core import mat83f, vec8f
     from mujoco.mjx.third_party.mujoco_warp._src.ray import ray_capsule, ray_cylinder, ray_ellipsoid, ray_sphere
+    from mujoco.mjx.third_party.mujoco_warp._src.render_util import _build_rays as build_rays
     from mujoco.mjx.third_party.mujoco_warp._src.render_util import pack_rgba_to_uint32
     from mujoco.mjx.third_party.mujoco_warp._src.types import ConstraintState, ContactType, mat43, vec5, vec10
     from mujoco.mjx.third_party.mujoco_warp._src.warp_util import event_scope
@@ -41,6 +42,7 @@ __all__ = [
     "ConstraintState",
     "ContactType",
     "Geom",
+    "build_rays",
     "event_scope",
     "installed_version",
     "jax_collision_driver",

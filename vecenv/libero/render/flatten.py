@@ -84,6 +84,7 @@ class _Flattening:
         self._textures: dict[int, str] = {}
         self._materials: dict[Look, str] = {}
         self._joined: dict[tuple[int, Look], list[Corners]] = {}
+        self._face_normals: dict[str, np.ndarray] = {}
         # By name of what is added: names of geoms survive compilation, indices do not.
         self._glows: dict[str, tuple[list[int], tuple[float, float, bool]]] = {}
 
@@ -98,6 +99,7 @@ class _Flattening:
         _add_cameras(self._model, self._bodies)
         _add_lights(self._model, self._bodies)
         model = self._spec.compile()
+        self._set_normals(model)
         _tighten(model)
         of_body = drawing.instances_of_bodies(self._model, self._scene)
         return Flattened(
@@ -156,10 +158,19 @@ class _Flattening:
             distinct, rows = _distinct(values.reshape(-1, values.shape[-1]))
             face = {"vert": "face", "normal": "facenormal", "texcoord": "facetexcoord"}[key]
             arrays[f"user{key}"], arrays[f"user{face}"] = distinct.ravel(), rows.ravel().astype(np.int32)
+        self._face_normals[name] = arrays["userfacenormal"].reshape(-1, 3)
         mesh = self._spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         for field, array in arrays.items():
             setattr(mesh, field, array)
         self._shape(body, _MESH, np.zeros(3), self._material(look), meshname=name)
+
+    def _set_normals(self, model: mujoco.MjModel) -> None:
+        """Say again which normals the corners of triangles have: MuJoCo keeps the normals of a spec, but not that."""
+        for name, rows in self._face_normals.items():
+            mesh = model.mesh(name).id
+            start, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+            assert (count, model.mesh_normalnum[mesh]) == (len(rows), rows.max() + 1)
+            model.mesh_facenormal[start : start + count] = rows
 
     def _material(self, look: Look) -> str:
         if look not in self._materials:

@@ -35,7 +35,7 @@ class Geoms:
 
 @wp.struct
 class Materials:
-    """MuJoCo's materials, their textures, and the texture coordinates of the meshes."""
+    """MuJoCo's materials and their textures."""
 
     texture_id: wp.array3d[int]
     uniform: wp.array2d[bool]
@@ -44,10 +44,23 @@ class Materials:
     specular: wp.array2d[float]
     shininess: wp.array2d[float]
     textures: wp.array[wp.Texture2D]
-    mesh_face_start: wp.array[int]
-    mesh_face_texcoord: wp.array[wp.vec3i]
-    mesh_texcoord: wp.array[wp.vec2]
-    mesh_texcoord_start: wp.array[int]
+
+
+@wp.struct
+class Meshes:
+    """The normals and texture coordinates of the corners of MuJoCo's meshes.
+
+    ``face_normal`` and ``face_texcoord`` are rows of ``normal`` and ``texcoord``, counted from ``normal_start`` and
+    ``texcoord_start`` of the mesh (-1: it has no texture coordinates); those of a mesh begin at its ``face_start``.
+    """
+
+    face_start: wp.array[int]
+    face_normal: wp.array[wp.vec3i]
+    normal: wp.array[wp.vec3]
+    normal_start: wp.array[int]
+    face_texcoord: wp.array[wp.vec3i]
+    texcoord: wp.array[wp.vec2]
+    texcoord_start: wp.array[int]
 
 
 @wp.struct
@@ -67,29 +80,44 @@ class Lights:
 
 
 @wp.struct
+class Scene:
+    """What rays meet and what lights it."""
+
+    geoms: Geoms
+    meshes: Meshes
+    materials: Materials
+    lights: Lights
+
+
+@wp.struct
 class Cameras:
     """The cameras, in the order of the images, and the directions of their rays in the camera's frame.
 
     ``width`` is how much wider a camera sees than the one the directions were made for, a ratio of tangents of half the
-    field of view. ``first_ray`` is the first direction of this pass: with several samples a pixel there is a pass for
-    each.
+    field of view; ``pixel`` is the width and height of a pixel of that one, 1 m away, in metres. ``first_ray`` is the
+    first direction of this pass: the number of the pass times the number of pixels of all cameras.
     """
 
     pos: wp.array2d[wp.vec3]
     mat: wp.array2d[wp.mat33]
     width: wp.array2d[float]
+    pixel: wp.array[wp.vec2]
     rays: wp.array[wp.vec3]
     first_ray: int
 
 
 @wp.struct
 class Images:
-    """The buffers that the kernel writes, [worlds, pixels of all cameras]; ``sums`` adds up samples of a pixel."""
+    """The buffers that the kernel writes, [worlds, pixels of all cameras].
+
+    ``sums`` adds up the samples of a pixel. ``queue`` holds the pixels that need more samples, see ``ray_passes``.
+    """
 
     rgb: wp.array2d[wp.uint32]
     sums: wp.array2d[wp.vec3]
     depth: wp.array2d[float]
     segmentation: wp.array2d[wp.vec2i]
+    queue: wp.array2d[int]
 
 
 @wp.struct
@@ -112,6 +140,14 @@ class Hit:
     u: float
     v: float
     face: int
+
+
+@wp.struct
+class Footprint:
+    """How far a step of one pixel to the right, and one down, moves a point, world frame, metres."""
+
+    right: wp.vec3
+    down: wp.vec3
 
 
 @wp.struct

@@ -18,12 +18,15 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import warp as wp
 from jaxtyping import PyTree
 from mujoco import mjx
 
+from vecenv.libero.render import ray_passes
 from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderError
 from vecenv.libero.render.ray_kernel import make_kernel
 from vecenv.libero.render.ray_light import HEADLIGHT
+from vecenv.libero.render.ray_surface import mipmapped
 from vecenv.libero.render.scenery import Scenery
 from vecenv.libero.render.surfaces import drawn_colors
 from vecenv.util.mapped import Sized
@@ -84,7 +87,9 @@ class RayTracer:
         cameras: which cameras, in the order of the images; ``"wrist"`` is an alias of ``"robot0_eye_in_hand"``, and
             None is a free camera, whose pose a ``Style`` gives.
         rgb, depth, segmentation: which images ``look`` makes.
-        samples: rays per pixel along each side, averaged; GL takes four samples per pixel. 2 takes four times as long.
+        samples: rays per pixel along each side, averaged, for every pixel. 2 takes four times as long as 1.
+        antialias: whether pixels that differ from their neighbours are traced again, through the four points where GL
+            takes its samples; with one sample per pixel only. Depths and segmentations stay those of the middle.
         block_dim: threads of a block on the GPU.
         tile: most rows and columns of pixels that neighbouring threads trace; ``(1, 1)`` for row by row.
         registers: most registers of a thread on the GPU; 0 leaves it to the compiler.
@@ -106,6 +111,7 @@ class RayTracer:
         depth: bool = False,
         segmentation: bool = False,
         samples: int = 1,
+        antialias: bool = True,
         block_dim: int = BLOCK,
         tile: tuple[int, int] = TILE,
         registers: int = REGISTERS,
@@ -120,9 +126,12 @@ class RayTracer:
         self._put = mjx.put_model(model, impl="warp")
         sizes = self._put._impl.block_dim.__class__(render=block_dim)
         self._put = self._put.tree_replace({"_impl.block_dim": sizes}).replace(**_lamps(model))
+        self._put = self._put.replace(cam_sensorsize=self._pixel_sizes())
         self._tile = math.gcd(height, tile[0]), math.gcd(width, tile[1])
         self._blank = mjx.make_data(model, impl="warp", naconmax=1, njmax=1)
-        self._options = {"samples_per_pixel": samples, "enable_backface_culling": culling}
+        self._antialias = antialias and samples == 1 and rgb
+        per_side = ray_passes.PASSES_PER_SIDE if self._antialias else samples
+        self._options = {"samples_per_pixel": per_side, "enable_backface_culling": culling}
         self._registers, self._devices = registers, devices
         self._contexts: dict[int, Any] = {}
         self._making = threading.Lock()
@@ -170,11 +179,23 @@ class RayTracer:
                         enabled_geom_groups=[1],
                         **self._options,
                     )
-                    for rays in context._contexts.values():  # one a device
-                        self._tile_rays(rays)
-                        rays._megakernel = make_kernel(self._model, rays, self._registers)
+                    for name in self._devices or (None,):
+                        with wp.ScopedDevice(name) as device:
+                            self._prepare(context._contexts[device.ordinal], num_worlds)
                     self._contexts[num_worlds] = context
             return self._contexts[num_worlds].pytree()
+
+    def _prepare(self, context: RenderContext, num_worlds: int) -> None:
+        """Give a render context our kernel, and what it needs."""
+        if self._antialias:
+            context.ray = ray_passes.aimed_rays(self._model, self._camera_ids, self.height, self.width)
+            context.flex_group_root = ray_passes.empty_queue(num_worlds, context.total_rays)
+        self._tile_rays(context)
+        context.textures_registry = mipmapped(self._model)
+        context.textures = wp.array(context.textures_registry, dtype=wp.Texture2D)
+        context._megakernel = make_kernel(
+            self._model, context, tile=self._tile, antialias=self._antialias, registers=self._registers
+        )
 
     def _tile_rays(self, context: RenderContext) -> None:
         """Reorder a render context's rays from rows of pixels to tiles, for each camera and sample."""
@@ -234,6 +255,11 @@ class RayTracer:
                 "_impl.light_xdir": jnp.concatenate([light_xdir[..., 0], spare]),
             }
         )
+
+    def _pixel_sizes(self) -> np.ndarray:
+        """Width and height of a pixel 1 m away from each camera, metres, [C, 2]."""
+        half = np.tan(np.deg2rad(self._model.cam_fovy[self._camera_ids]) / 2)
+        return np.repeat(2 * half[:, None] / self.height, 2, axis=1).astype(np.float32)
 
     def _widths(self, style: Style) -> jax.Array:
         """How much wider the cameras see than those that the contexts' rays were made for."""

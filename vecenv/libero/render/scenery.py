@@ -23,9 +23,9 @@ from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.libero.scene.scene import Scene, compile_scene
 
 # Version of the files; it counts up when their contents change.
-_VERSION = 3
+_VERSION = 4
 # Longest side of a texture, texels.
-TEXTURE_SIDE = 256
+TEXTURE_SIDE = 640
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,7 @@
 """What the surfaces of a scene's visual model are made of: colours, materials, textures, and the triangles of meshes.
 
 In: a compiled visual model and a geom of it. Out: the geom's ``Look``, its ``Corners`` in the frame of its body, and
-textures averaged to the size that cameras see them in. MuJoCo's GL averages a texture over the area that a pixel shows
-(mipmaps); MuJoCo Warp looks up one point, so textures are reduced beforehand.
+textures reduced to about the size that cameras see them in, by the rule that GL's mipmaps are made by.
 """
 
 from __future__ import annotations
@@ -120,35 +119,36 @@ def matrix(quat: np.ndarray) -> np.ndarray:
 
 
 def texture_pixels(model: mujoco.MjModel, index: int, side: int) -> np.ndarray:
-    """A texture, uint8 [h, w, 3], averaged to at most ``side`` texels a side."""
+    """A texture, uint8 [h, w, 3]: the first level of its mipmap with at most ``side`` texels a side, decoded."""
     height, width, channels = model.tex_height[index], model.tex_width[index], model.tex_nchannel[index]
     start = model.tex_adr[index]
     pixels = model.tex_data[start : start + height * width * channels].reshape(height, width, channels)[..., :3]
     if model.tex_type[index] == mujoco.mjtTexture.mjTEXTURE_CUBE and height == 6 * width:
         pixels = pixels[:width]
-    linear = _reduced(_reduced(_halved(pixels, 2 * side), side, 0), side, 1) / 255
     if model.tex_colorspace[index] == mujoco.mjtColorSpace.mjCOLORSPACE_SRGB:
-        linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
-    return np.rint(255 * linear).astype(np.uint8)
+        pixels = _DECODED[pixels]
+    while max(pixels.shape[:2]) > side:
+        pixels = next_level(pixels)
+    return np.rint(pixels).astype(np.uint8)
 
 
-def _halved(image: np.ndarray, side: int) -> np.ndarray:
-    """Float32 of an image [h, w, c], whole blocks averaged while both sides are at least twice ``side``."""
-    step = max(1, min(image.shape[:2]) // side)
-    height, width = image.shape[0] // step, image.shape[1] // step
-    blocks = image[: height * step, : width * step].reshape(height, step, width, step, -1)
-    return blocks.mean((1, 3), dtype=np.float32)
+def next_level(image: np.ndarray) -> np.ndarray:
+    """The next level of a mipmap, float32 [h / 2, w / 2, c], of an image [h, w, c].
+
+    It is made as Mesa makes it: a texel is interpolated between two of the level before, at its middle. Sides of even
+    length are averaged in pairs; of odd ones, texels count differently.
+    """
+    for axis in (0, 1):
+        size = image.shape[axis]
+        count = max(size // 2, 1)
+        if count < size:
+            place = (np.arange(count) + 0.5) * size / count - 0.5
+            low = place.astype(int)
+            part = (place - low).astype(np.float32).reshape([-1 if a == axis else 1 for a in range(image.ndim)])
+            image = np.take(image, low, axis) * (1 - part) + np.take(image, low + 1, axis) * part
+    return image.astype(np.float32)
 
 
-def _reduced(image: np.ndarray, side: int, axis: int) -> np.ndarray:
-    """Averaged along an axis to at most ``side`` entries."""
-    size = image.shape[axis]
-    if size <= side:
-        return image
-    sums = np.cumsum(image, axis=axis, dtype=np.float64)
-    sums = np.concatenate([np.zeros_like(np.take(sums, [0], axis)), sums], axis=axis)
-    edges = np.linspace(0, size, side + 1)
-    low = np.minimum(edges.astype(int), size - 1)
-    part = (edges - low).reshape([-1 if a == axis else 1 for a in range(image.ndim)])
-    at = np.take(sums, low, axis) * (1 - part) + np.take(sums, low + 1, axis) * part
-    return (np.diff(at, axis=axis) * (side / size)).astype(np.float32)
+_CODES = np.arange(256) / 255
+# What sRGB's codes stand for, of 255.
+_DECODED = (255 * np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4)).astype(np.float32)
