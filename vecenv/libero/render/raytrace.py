@@ -21,7 +21,8 @@ from jaxtyping import PyTree
 from mujoco import mjx
 
 from vecenv.libero.physics.private import render_context
-from vecenv.libero.render.drawing import Pose, View
+from vecenv.libero.render.culling import View
+from vecenv.libero.render.drawing import Pose
 from vecenv.libero.render.gl import Frames, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.render.ray_kernel import make_kernel
