@@ -55,6 +55,14 @@ class Layer(NamedTuple):
     pixels: np.ndarray
 
 
+class Looks(NamedTuple):
+    """The looks of items under some visual options; which are known and which a canvas draws, bool [items]."""
+
+    by_item: dict[int, Look]
+    known: np.ndarray
+    drawable: np.ndarray
+
+
 class Layers:
     """The layers of one GL context, each of one camera of one slot.
 
@@ -123,7 +131,8 @@ class Compositor:
         self._context, self._canvas, self._layers = context, Canvas(context), layers
         self._has_shadows, self._num_geoms, self._boxes = stage.has_shadows, stage.model.ngeom, stage.boxes
         self.whole = mujoco.MjrRect(0, 0, width, height)
-        self._looks: list[tuple[VisualOptions, dict[int, Look]]] = []
+        self._num_items = stage.model.ngeom + stage.model.nsite
+        self._looks: list[tuple[VisualOptions, Looks]] = []
         self._histories: dict[tuple[int, str], Stillness] = {}
         self._held: dict[tuple[int, str], Layer] = {}
 
@@ -131,27 +140,27 @@ class Compositor:
         """The next image of a camera of a slot."""
         return Picture(self, (slot, camera), options)
 
-    def looks(self, options: VisualOptions) -> dict[int, Look]:
-        """The looks of items that are known so far, by item."""
+    def looks(self, options: VisualOptions) -> Looks:
+        """The looks of items that are known so far."""
         for known, looks in self._looks:
             if known is options or known == options:
                 return looks
         if len(self._looks) == _KEPT_OPTIONS:
             self._looks.pop(0)
-        self._looks.append((options, {}))
+        self._looks.append((options, Looks({}, *np.zeros((2, self._num_items), bool))))
         return self._looks[-1][1]
 
-    def learn(self, looks: dict[int, Look], frame: mujoco.MjvScene) -> None:
+    def learn(self, looks: Looks, frame: mujoco.MjvScene) -> None:
         """Add the looks of what is in a frame."""
         for geom in frame.geoms[: frame.ngeom]:
             if geom.objtype in _ITEMS:
                 item = geom.objid + (self._num_geoms if geom.objtype == mujoco.mjtObj.mjOBJ_SITE else 0)
-                looks.setdefault(item, Look.of(geom))
+                look = looks.by_item.setdefault(item, Look.of(geom))
+                looks.known[item], looks.drawable[item] = True, look.is_supported
 
-    def can_draw(self, sight: Sight, looks: dict[int, Look], items: np.ndarray) -> bool:
+    def can_draw(self, sight: Sight, looks: Looks, items: np.ndarray) -> bool:
         """Whether a canvas draws these items of an image."""
-        known = (looks.get(item) for item in np.flatnonzero(items).tolist())
-        return sight.is_opaque and not self._has_shadows and all(look is not None and look.is_supported for look in known)
+        return sight.is_opaque and not self._has_shadows and bool((looks.drawable | ~items).all())
 
     def plan(self, key: tuple[int, str], sight: Sight, options: VisualOptions) -> tuple[Plan, Layer | None]:
         """How to draw an image, and its layer."""
@@ -213,23 +222,23 @@ class Compositor:
         yield
         self._gl.Disable(_SCISSOR_TEST)
 
-    def draw_items(self, frame: mujoco.MjvScene, looks: dict[int, Look], items: np.ndarray, sight: Sight) -> None:
+    def draw_items(self, frame: mujoco.MjvScene, looks: Looks, items: np.ndarray, sight: Sight) -> None:
         """Draw items over the framebuffer."""
         numbers = np.flatnonzero(items)
         if len(numbers):
             self._canvas.switch(frame, on=True)
-            self._canvas.draw([looks[item] for item in numbers.tolist()], sight.poses[numbers])
+            self._canvas.draw([looks.by_item[item] for item in numbers.tolist()], sight.poses[numbers])
             self._canvas.switch(frame, on=False)
 
-    def draw_mirror(self, frame: mujoco.MjvScene, looks: dict[int, Look], sight: Sight) -> None:
+    def draw_mirror(self, frame: mujoco.MjvScene, looks: Looks, sight: Sight) -> None:
         """Draw what the mirror shows."""
         shown = sight.reflected.copy()
         shown[sight.mirror] = False
         numbers = np.flatnonzero(shown)
         self._canvas.reflect(
             frame,
-            (looks[sight.mirror], sight.poses[sight.mirror], sight.reflectance),
-            [looks[item] for item in numbers.tolist()],
+            (looks.by_item[sight.mirror], sight.poses[sight.mirror], sight.reflectance),
+            [looks.by_item[item] for item in numbers.tolist()],
             sight.poses[numbers],
         )
 
@@ -262,7 +271,7 @@ class Picture:
 
     def _choose(self, sight: Sight) -> np.ndarray:
         on = self._on
-        if not self._looks:
+        if not self._looks.by_item:
             return sight.drawable  # what is out of sight changes no pixel, and all looks are known from then on
         own = sight.reflected if sight.mirror >= 0 else np.zeros_like(sight.shown)
         if not on.can_draw(sight, self._looks, own):
@@ -286,7 +295,7 @@ class Picture:
         frame.flags[_REFLECTION] = not has_mirror
         area = on.whole
         if self._plan.held is None or layer is None:
-            if not self._looks.keys() >= set(np.flatnonzero(self._chosen).tolist()):
+            if (self._chosen & ~self._looks.known).any():
                 on.learn(self._looks, frame)
             on.draw(frame)
         else:
@@ -296,7 +305,7 @@ class Picture:
             with on.within(area):
                 on.draw_items(frame, self._looks, moved, sight)
         if has_mirror:
-            with on.within(area):
+            with on.within(on.area(sight, np.zeros_like(sight.shown))):
                 on.draw_mirror(frame, self._looks, sight)
         frame.flags[_REFLECTION] = True
         on.read(area, out)

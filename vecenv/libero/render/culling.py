@@ -7,6 +7,7 @@ outside the image costs more than what is in it: software GL clips triangles one
 from __future__ import annotations
 
 import itertools
+from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -19,6 +20,8 @@ from vecenv.libero.render.options import CameraShift, rotation_of
 DRAWN_GROUPS, HIDDEN = (1, 2), 5
 # Rays per side of the grid that tests whether the sky is visible.
 _GRID = 17
+# Of so many views it is known whether walls fill them.
+_KEPT_VIEWS = 256
 # Corners of a box.
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 # Boxes that reach nearer to the camera than this, metres, may cover the whole image.
@@ -69,7 +72,8 @@ class Boxes:
         self._half = np.concatenate([model.geom_aabb[:, 3:], sites])
         # Planes are infinite; MuJoCo gives them the radius 0.
         self._endless = np.concatenate([model.geom_rbound == 0, np.zeros(len(sites), bool)])
-        self._geoms = slice(model.ngeom)
+        self._drawn = np.flatnonzero(np.isin(model.geom_group, DRAWN_GROUPS))
+        self._num_geoms = model.ngeom
 
     def area(self, poses: np.ndarray, items: np.ndarray, view: View, size: tuple[int, int]) -> mujoco.MjrRect | None:
         """The part of an image that some items may cover; None if one reaches behind the camera or has no end.
@@ -97,12 +101,15 @@ class Boxes:
         return mujoco.MjrRect(left, bottom, right - left, top - bottom)
 
     def in_sight(self, data: mujoco.MjData, cone: Cone) -> np.ndarray:
-        """Geoms whose box is not wholly outside one side of a cone, bool [ngeom]."""
-        turn = data.geom_xmat.reshape(-1, 3, 3)
-        center = data.geom_xpos + np.einsum("nij,nj->ni", turn, self._center[self._geoms])
-        reach = np.einsum("nk,snk->sn", self._half[self._geoms], np.abs(np.einsum("si,nij->snj", cone.sides, turn)))
-        distance = cone.sides @ (center - cone.apex).T
-        return self._endless[self._geoms] | (distance - reach <= cone.bounds[:, None]).all(axis=0)
+        """Geoms of groups that are drawn whose box is not wholly outside one side of a cone, bool [ngeom]."""
+        drawn = self._drawn
+        turn = data.geom_xmat[drawn].reshape(-1, 3, 3)
+        center = data.geom_xpos[drawn] + (turn @ self._center[drawn, :, None])[..., 0]
+        reach = (np.abs(cone.sides @ turn) @ self._half[drawn, :, None])[..., 0]
+        distance = (center - cone.apex) @ cone.sides.T
+        found = np.zeros(self._num_geoms, bool)
+        found[drawn] = self._endless[drawn] | (distance - reach <= cone.bounds).all(axis=1)
+        return found
 
 
 class Mirrors:
@@ -160,9 +167,21 @@ class Walls:
         half[planes] = np.where(half[planes] > 0, half[planes], np.inf)
         half[planes, 2] = 0
         self._half, self._is_plane = half, planes
+        self._known: OrderedDict[bytes, bool] = OrderedDict()
 
     def fill(self, data: mujoco.MjData, view: View, aspect: float) -> bool:
         """Whether all of a grid of rays over the image, its corners included, end at a wall."""
+        key = b"".join(
+            np.ascontiguousarray(part).tobytes()
+            for part in (view.pos, view.mat, [view.fovy, aspect], data.geom_xpos[self._geoms])
+        )
+        if key not in self._known:
+            self._known[key] = self._fill(data, view, aspect)
+            if len(self._known) > _KEPT_VIEWS:
+                self._known.popitem(last=False)
+        return self._known[key]
+
+    def _fill(self, data: mujoco.MjData, view: View, aspect: float) -> bool:
         rays = _image_rays(view, aspect)
         turn = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
         eye = np.einsum("nji,nj->ni", turn, view.pos - data.geom_xpos[self._geoms])[:, None]

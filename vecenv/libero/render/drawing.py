@@ -249,7 +249,10 @@ class Stage:
         model.geom_group[:] = np.where(drawn[: model.ngeom], self._groups, HIDDEN)
         model.site_group[:] = np.where(drawn[model.ngeom :], self._site_groups, HIDDEN)
         # MuJoCo draws everything once more for each mirror, also for one outside the image.
-        model.mat_reflectance[:] = np.where(np.isin(np.arange(model.nmat), model.geom_matid[seen]), self._shine, 0)
+        materials = model.geom_matid[seen]
+        model.mat_reflectance[:] = 0
+        materials = materials[materials >= 0]
+        model.mat_reflectance[materials] = self._shine[materials]
         eye = mujoco.MjvCamera()
         eye.type, eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         mujoco.mjv_updateScene(model, data, self._option, None, eye, mujoco.mjtCatBit.mjCAT_ALL, frame)

@@ -27,7 +27,7 @@ STORED = ("exact", "fast")
 LEAST = {"exact": 8000, "fast": 0}
 # Joint positions are rounded to this before they are drawn, metres and radians: objects at rest, which physics lets creep,
 # then have one pose. It moves surfaces less than the level itself does.
-GRID = {"original": 0.0, "exact": 1e-5, "fast": 5e-5}
+GRID = {"original": 0.0, "exact": 1e-6, "fast": 2e-5}
 # Normals are stored as whole numbers up to this.
 NORMAL_SCALE = 127
 
