@@ -9,16 +9,21 @@ from contextlib import contextmanager
 import mujoco
 import numpy as np
 import pytest
+from support import upstream
 from support.box_scene import SIZE, shot, tiny_scene
 from support.images import needs_gl
 
-from vecenv.libero.render import gl
+import vecenv
+from vecenv.libero.env import LiberoEnv
+from vecenv.libero.render import gl, lod
+from vecenv.libero.render.colors import visual_scene
 from vecenv.libero.render.composite import Compositor
 from vecenv.libero.render.culling import View
 from vecenv.libero.render.drawing import Pose, Sight, Stage
 from vecenv.libero.render.gl import GlRenderer, Shot
-from vecenv.libero.render.options import CameraShift, VisualOptions
+from vecenv.libero.render.options import POLICY_CAMERAS, CameraShift, VisualOptions
 from vecenv.libero.render.stillness import SETTLED, Stillness
+from vecenv.libero.tasks.suites import list_tasks
 
 EYES = ("agentview", "side")
 
@@ -220,9 +225,13 @@ def test_what_has_not_moved_is_held_from_the_second_image_on() -> None:
     poses = poses.copy()
     poses[2] = 1
     plan = history.plan(sight(poses), VisualOptions())
-    assert plan.is_new and plan.held is not None and plan.held.tolist() == [True, True, False]
+    assert plan.is_new
+    assert plan.held is not None
+    assert plan.held.tolist() == [True, True, False]
     plan = history.plan(sight(poses), VisualOptions())
-    assert not plan.is_new and plan.held is not None and plan.held.tolist() == [True, True, False]
+    assert not plan.is_new
+    assert plan.held is not None
+    assert plan.held.tolist() == [True, True, False]
 
 
 def test_what_moves_leaves_the_layer_and_comes_back_when_it_has_settled() -> None:
@@ -254,4 +263,37 @@ def test_what_is_no_longer_shown_leaves_the_layer() -> None:
     for _ in range(3):
         history.plan(sight(poses), VisualOptions())
     plan = history.plan(sight(poses, np.array([True, False])), VisualOptions())
-    assert plan.is_new and plan.held is not None and plan.held.tolist() == [True, False]
+    assert plan.is_new
+    assert plan.held is not None
+    assert plan.held.tolist() == [True, False]
+
+
+@needs_gl
+@pytest.mark.heavy
+@pytest.mark.parametrize("scene_id", upstream.scene_ids())
+def test_images_of_rollouts_are_the_whole_ones(monkeypatch: pytest.MonkeyPatch, scene_id: str) -> None:
+    """Every scene: slots in motion and refilled, one with every joint somewhere else, all cameras that policies see."""
+    suite, task = scene_id.rsplit("-", 1)
+    rng = np.random.default_rng(int(task))
+    env = vecenv.make(suite, task=int(task), episodes=range(2))
+    assert isinstance(env, LiberoEnv)
+    problem = list_tasks(suite)[int(task)].problem()
+    stage = Stage(visual_scene(problem, "published", "fast"), lod.GRID["fast"])
+    with drawn(monkeypatch, stage, size=128) as both:
+        for episodes in (range(2), range(2, 4)):
+            env.set_episodes(episodes=list(episodes))
+            env.reset()
+            for tick in range(8):
+                env.step_continuous(rng.uniform(-1, 1, (2, 7)))
+                if tick == 5:
+                    qpos = np.stack([upstream.shuffled(env.mj_model, row, rng) for row in env.state().qpos])
+                    env.set_state(qpos=qpos, qvel=np.zeros((2, env.mj_model.nv)))
+                both.compare(*_shots(env), cameras=POLICY_CAMERAS)
+        print(scene_id, both.copies)
+    env.close()
+
+
+def _shots(env: LiberoEnv) -> list[Shot]:
+    (group,) = env.physics.groups
+    pos, quat = group.expand("body_pos"), group.expand("body_quat")
+    return [Shot(0, Pose(group.seen_qpos[row].copy(), pos[row], quat[row])) for row in range(len(group.slots))]

@@ -2,8 +2,8 @@
 
 ``mujoco.mjr_render`` begins with an empty image. A ``Canvas`` adds to the image that is there, after an ``mjr_render``
 has set lights and camera: it takes the looks of geoms from a filled ``MjvScene`` and gives OpenGL the commands that
-MuJoCo gives (``renderGeom`` in its ``render_gl3.c``), for opaque geoms and sites without shadows, so pixels are equal to
-MuJoCo's. Meshes and textures are those that the ``MjrContext`` has uploaded.
+MuJoCo gives (``renderGeom`` in its ``render_gl3.c``), for opaque geoms and sites without shadows, so pixels are equal
+to MuJoCo's. Meshes and textures are those that the ``MjrContext`` has uploaded.
 """
 
 from __future__ import annotations
@@ -136,10 +136,15 @@ class Canvas:
                 self._gl.Lightfv(LIGHT0 + number, SPOT_DIRECTION, _floats(*light.dir.tolist(), 0))
                 self._gl.Lightfv(LIGHT0 + number, POSITION, _floats(*light.pos.tolist(), 1))
 
+    def clear_stencil(self) -> None:
+        """Set the stencil to 0."""
+        self._gl.ClearStencil(0)
+        self._gl.Clear(STENCIL_BITS)
+
     def reflect(
         self, frame: mujoco.MjvScene, mirror: tuple[Look, np.ndarray, float], looks: Sequence[Look], poses: np.ndarray
     ) -> None:
-        """Draw what a mirror shows into an image that was drawn without reflections.
+        """Draw what a mirror shows into an image that was drawn without reflections; the stencil must be 0.
 
         Args:
             frame: its lights and camera are those of the image.
@@ -168,8 +173,6 @@ class Canvas:
         """Set the stencil to 2 where the mirror's upper side is seen, to 1 where another side is, 0 elsewhere."""
         gl = self._gl
         gl.Enable(STENCIL_TEST)
-        gl.ClearStencil(0)
-        gl.Clear(STENCIL_BITS)
         gl.ColorMask(0, 0, 0, 0)
         gl.DepthMask(0)
         gl.StencilFunc(ALWAYS, 1, 0xFF)

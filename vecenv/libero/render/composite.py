@@ -1,13 +1,14 @@
 """Images of which only that is drawn which has moved since the last one.
 
 In: what a camera of a slot sees, image after image. Out: the same image, to the bit, as ``mujoco.mjr_render`` draws of
-it. What stands still in front of a camera that stands still (``vecenv.libero.render.stillness``) is drawn by MuJoCo once
-into a layer: colour and depth of every sample. The layer is then copied into the framebuffer, and what has moved is drawn
-over it (``vecenv.libero.render.canvas``). A mirror is drawn after everything else, and with it only what it shows, while
-MuJoCo draws everything twice.
+it. What stands still in front of a camera that stands still (``vecenv.libero.render.stillness``) is drawn by MuJoCo
+once, into a layer: colour and depth of every sample. Of the next images, a layer gives all but the rectangle around
+what has moved; in there, its samples are copied into the framebuffer and what has moved is drawn over them
+(``vecenv.libero.render.canvas``). A mirror is drawn after everything else, and with it only what it shows, while MuJoCo
+draws everything twice.
 
-A layer of 256 x 256 pixels takes 3.3 MB. Where the memory for layers is used up, or an image has something that a canvas
-does not draw (transparent things, shadows), MuJoCo draws the whole image.
+A layer of 256 x 256 pixels takes 3.3 MB. Where the memory for layers is used up, or an image has something that a
+canvas does not draw (transparent things, shadows), MuJoCo draws the whole image.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from vecenv.libero.render.options import VisualOptions
 from vecenv.libero.render.stillness import Plan, Stillness
 
 # Memory for the layers of all threads of a renderer, bytes.
-LAYER_MEMORY = 512 << 20
+LAYER_MEMORY = 256 << 20
 # The drivers for which drawing less saves more than it costs; GPUs draw a scene faster than Python lists what moved.
 _SOFTWARE = ("llvmpipe", "softpipe", "swrast")
 # Slots have other options each, at most so many sets of looks are kept.
@@ -44,8 +45,12 @@ _ITEMS = (mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_SITE)
 
 
 def is_worthwhile() -> bool:
-    """Whether the driver of this thread's context draws on the CPU."""
-    return commands.renderer_name().startswith(_SOFTWARE)
+    """Whether the driver of this thread's context draws on the CPU and has all commands."""
+    try:
+        commands.commands()
+        return commands.renderer_name().startswith(_SOFTWARE)
+    except AttributeError:
+        return False
 
 
 class Layer(NamedTuple):
@@ -124,9 +129,7 @@ class Compositor:
         whole: the whole image.
     """
 
-    def __init__(
-        self, stage: Stage, context: mujoco.MjrContext, layers: Layers, height: int, width: int
-    ) -> None:
+    def __init__(self, stage: Stage, context: mujoco.MjrContext, layers: Layers, height: int, width: int) -> None:
         self._gl: Any = commands.commands()
         self._context, self._canvas, self._layers = context, Canvas(context), layers
         self._has_shadows, self._num_geoms, self._boxes = stage.has_shadows, stage.model.ngeom, stage.boxes
@@ -235,12 +238,17 @@ class Compositor:
         shown = sight.reflected.copy()
         shown[sight.mirror] = False
         numbers = np.flatnonzero(shown)
-        self._canvas.reflect(
-            frame,
-            (looks.by_item[sight.mirror], sight.poses[sight.mirror], sight.reflectance),
-            [looks.by_item[item] for item in numbers.tolist()],
-            sight.poses[numbers],
-        )
+        area = self.area(sight, np.zeros_like(shown))
+        # llvmpipe draws some samples of pixels at the edge of the scissor's rectangle and does not clear them.
+        with self.within(_grown(area, 2)):
+            self._canvas.clear_stencil()
+        with self.within(area):
+            self._canvas.reflect(
+                frame,
+                (looks.by_item[sight.mirror], sight.poses[sight.mirror], sight.reflectance),
+                [looks.by_item[item] for item in numbers.tolist()],
+                sight.poses[numbers],
+            )
 
     def area(self, sight: Sight, items: np.ndarray) -> mujoco.MjrRect:
         """The part of the image that items and the mirror may cover."""
@@ -251,6 +259,11 @@ class Compositor:
             return mujoco.MjrRect(0, 0, 1, 1)
         found = self._boxes.area(sight.poses, covered, sight.view, (self.whole.height, self.whole.width))
         return found or self.whole
+
+
+def _grown(area: mujoco.MjrRect, margin: int) -> mujoco.MjrRect:
+    """A rectangle with so many pixels more on each side, which may lie outside the image."""
+    return mujoco.MjrRect(area.left - margin, area.bottom - margin, area.width + 2 * margin, area.height + 2 * margin)
 
 
 class Picture:
@@ -305,8 +318,7 @@ class Picture:
             with on.within(area):
                 on.draw_items(frame, self._looks, moved, sight)
         if has_mirror:
-            with on.within(on.area(sight, np.zeros_like(sight.shown))):
-                on.draw_mirror(frame, self._looks, sight)
+            on.draw_mirror(frame, self._looks, sight)
         frame.flags[_REFLECTION] = True
         on.read(area, out)
 

@@ -124,9 +124,9 @@ class Stage:
         self._shine = model.mat_reflectance.copy()
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = [group in DRAWN_GROUPS for group in range(mujoco.mjNGROUP)]
-        alpha = np.concatenate([
-            _alpha(model, model.geom_rgba, model.geom_matid), _alpha(model, model.site_rgba, model.site_matid)
-        ])
+        alpha = np.concatenate(
+            [_alpha(model, model.geom_rgba, model.geom_matid), _alpha(model, model.site_rgba, model.site_matid)]
+        )
         self._visible, self._panes = alpha > 0, (alpha > 0) & (alpha < _OPAQUE)
         self.has_shadows = bool(model.light_castshadow.any()) and model.vis.quality.shadowsize > 0
 
@@ -280,9 +280,9 @@ class Stage:
             np.concatenate([there & (mask | self._always), sites]) & self._visible
             for mask in (np.ones_like(seen), seen, in_image, reflected)
         ]
-        poses = np.concatenate([
-            np.concatenate([data.geom_xpos, data.site_xpos]), np.concatenate([data.geom_xmat, data.site_xmat])
-        ], axis=1)
+        poses = np.concatenate(
+            [np.concatenate([data.geom_xpos, data.site_xpos]), np.concatenate([data.geom_xmat, data.site_xmat])], axis=1
+        )
         panes = (masks[1] & self._panes).any() or self._mirrors.from_behind(data, view, masks[1])
         return seen, Sight(view, *masks, mirror=mirror, reflectance=shine, poses=poses, is_opaque=not panes)
 

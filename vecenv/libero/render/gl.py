@@ -27,9 +27,9 @@ import mujoco
 import numpy as np
 
 from vecenv.errors import SimulationError
-from vecenv.libero.render.displays import GlContext, egl_context
 from vecenv.libero.render.composite import LAYER_MEMORY, Compositor, Layers, Picture, is_worthwhile
 from vecenv.libero.render.culling import View
+from vecenv.libero.render.displays import GlContext, egl_context
 from vecenv.libero.render.drawing import Pose, Stage, camera_view
 from vecenv.libero.render.options import RenderError, UserCamera, VisualOptions
 from vecenv.libero.render.worker import Worker
@@ -440,7 +440,7 @@ class _Painter:
         return self._pixels.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16], np.int32)
 
     def _context(self, stage: int) -> mujoco.MjrContext:
-        """The scene's context, whose framebuffer is then the one that is drawn into: ``mjr_render`` does not see to it."""
+        """The scene's context; from then on its framebuffer is drawn into, which ``mjr_render`` does not see to."""
         if stage not in self._contexts:
             self._contexts[stage] = self._stages[stage].context(*self._depth.shape)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._contexts[stage])
