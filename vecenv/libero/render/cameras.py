@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 
 from vecenv.libero.physics.base import Group
+from vecenv.libero.render import lod
 from vecenv.libero.render.colors import visual_scene
 from vecenv.libero.render.drawing import ROBOT, Pose, Stage, camera_view
 from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
@@ -51,7 +52,7 @@ def stage_of(problem: Problem, physics: mujoco.MjModel, level: str, colors: str)
         if stage is None:
             scene = visual_scene(problem, colors, level)
             mujoco.mj_clearCache(mujoco.mj_getCache())  # 0.37 GB of decoded files
-            stage = _stages[key] = Stage(scene)
+            stage = _stages[key] = Stage(scene, lod.GRID[level])
         _kept[key] = stage
         _kept.move_to_end(key)
         while len(_kept) > _KEPT:

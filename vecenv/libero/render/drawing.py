@@ -11,6 +11,7 @@ geoms, no sites of the gripper, and a stove's burner while the stove is on.
 from __future__ import annotations
 
 import functools
+import itertools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,21 +21,20 @@ import mujoco
 import numpy as np
 
 from vecenv.libero.render.colors import SKIN
-from vecenv.libero.render.options import ALIASES, CameraShift, RenderError, UserCamera, VisualOptions, rotation_of
+from vecenv.libero.render.culling import DRAWN_GROUPS, HIDDEN, Boxes, Cone, Mirrors, View, Walls
+from vecenv.libero.render.options import ALIASES, RenderError, UserCamera, VisualOptions
 from vecenv.libero.scene import catalog
 from vecenv.libero.scene.scene import Entity, Scene
 from vecenv.observations import CameraView
 
-# Groups that upstream draws: 1 holds visual geoms, 2 nothing; 0 are collision geoms. A culled geom moves to 5.
-DRAWN_GROUPS, _HIDDEN = (1, 2), 5
 # Upstream does not draw sites of these names.
 TOOL_SITES = ("robot0_", "gripper0_")
 ROBOT = "robot"
 _ROBOT_BODIES = ("robot0_", "gripper0_", "mount0_")
 # Spare entries for what MuJoCo adds to the model's geoms and sites.
 _SPARE_GEOMS = 64
-# Rays per side of the grid that tests whether the sky is visible.
-_GRID = 17
+# MuJoCo draws a geom in its material's colour while the geom's own is this, and blends what is less opaque than that.
+_UNSET, _OPAQUE = np.array([0.5, 0.5, 0.5, 1.0]), 0.995
 _FONT = mujoco.mjtFontScale.mjFONTSCALE_50
 
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
@@ -50,23 +50,6 @@ class Pose:
     body_quat: np.ndarray
 
 
-@dataclass(frozen=True)
-class View:
-    """One camera of one slot: ``pos`` [3] in metres, ``mat`` [3, 3] (columns right, up, back), ``fovy`` in degrees."""
-
-    pos: np.ndarray
-    mat: np.ndarray
-    fovy: float
-
-    def shifted(self, shift: CameraShift) -> View:
-        """The view moved in its own frame."""
-        return View(
-            self.pos + self.mat @ np.asarray(shift.pos, float),
-            self.mat @ rotation_of(shift.turn),
-            float(np.clip(self.fovy + shift.fovy, 1.0, 179.0)),
-        )
-
-
 def camera_view(views: Sequence[View], height: int, width: int) -> CameraView:
     """The contract's ``CameraView`` of a camera, from the views of B slots."""
     focal = np.array([height / 2 / np.tan(np.deg2rad(view.fovy) / 2) for view in views])
@@ -79,37 +62,73 @@ def camera_view(views: Sequence[View], height: int, width: int) -> CameraView:
     return CameraView(intrinsics=matrices, pos=np.stack([view.pos for view in views]), mat=rotations)
 
 
+@dataclass(frozen=True)
+class Sight:
+    """What there is to see for a camera of a slot. Items are the model's geoms, then its sites.
+
+    Attributes:
+        view: where the camera is.
+        drawable: items that would be drawn if they were in sight, bool [items].
+        shown: items that are drawn: those of the image and of its mirrors.
+        in_image: without mirrors. reflected: those that the mirror shows, and shapes that are never culled.
+        mirror, reflectance: the geom that reflects, -1 for none, and the part of the light.
+        poses: positions and rotation matrices of items, world frame, [items, 12].
+        is_opaque: whether nothing transparent is shown.
+    """
+
+    view: View
+    drawable: np.ndarray
+    shown: np.ndarray
+    in_image: np.ndarray
+    reflected: np.ndarray
+    mirror: int
+    reflectance: float
+    poses: np.ndarray
+    is_opaque: bool
+
+
 class Stage:
     """The visual model of a scene, which threads pose in turns.
 
     Args:
         scene: compiled with ``visual=True``; nothing else may use its model.
+        grid: positions of joints are rounded to multiples of this (metres, radians, parts of a unit quaternion) before
+            they are drawn, so that an object at rest, which physics lets creep by nanometres, is drawn in one place.
 
     Attributes:
         model: the visual model.
         cameras: names of its cameras.
         instances: the names that segmentation images index; "" (index 0) is everything else: table, floor, walls.
+        boxes: the bounding boxes of its items.
+        has_shadows: whether a light casts shadows.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, grid: float = 0.0) -> None:
         self.model = model = scene.model
         self.cameras = _names(model, _CAMERA, model.ncam)
         self.instances = ("", ROBOT, *scene.entities)
         self._instance_of_body = instances_of_bodies(model, scene)
         self._data = mujoco.MjData(model)
+        self._grid = grid
         self._lock = threading.Lock()
-        self._groups, self._shine = model.geom_group.copy(), model.mat_reflectance.copy()
         # Only meshes are culled. Other shapes have few triangles, and Mesa's software driver sometimes smears a wall
         # behind the camera into the image: upstream's images have that, so these must too.
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
-        self._boxes, self._walls, self._mirrors = _Boxes(model), _Walls(model), _Mirrors(model)
+        self.boxes, self._walls, self._mirrors = Boxes(model), Walls(model), Mirrors(model)
         self._burners = _burners(model, scene)
         self._skins = np.array([model.geom(geom).name.startswith(SKIN) for geom in range(model.ngeom)], bool)
         for site in range(model.nsite):
             if model.site(site).name.startswith(TOOL_SITES):
-                model.site_group[site] = _HIDDEN
+                model.site_group[site] = HIDDEN
+        self._groups, self._site_groups = model.geom_group.copy(), model.site_group.copy()
+        self._shine = model.mat_reflectance.copy()
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = [group in DRAWN_GROUPS for group in range(mujoco.mjNGROUP)]
+        alpha = np.concatenate(
+            [_alpha(model, model.geom_rgba, model.geom_matid), _alpha(model, model.site_rgba, model.site_matid)]
+        )
+        self._visible, self._panes = alpha > 0, (alpha > 0) & (alpha < _OPAQUE)
+        self.has_shadows = bool(model.light_castshadow.any()) and model.vis.quality.shadowsize > 0
 
     def check_physics(self, physics: mujoco.MjModel) -> None:
         """Check that the poses of a physics model fit.
@@ -160,14 +179,18 @@ class Stage:
         *,
         slot: int,
         aspect: float,
-    ) -> list[View]:
-        """Fill one frame per camera with what it sees of a slot; ``aspect`` is the image's width over its height."""
+        choices: Sequence[Callable[[Sight], np.ndarray]] = (),
+    ) -> list[Sight]:
+        """Fill one frame per camera with what it sees of a slot; ``aspect`` is the image's width over its height.
+
+        ``choices`` has a function per camera that says which of the items in sight its frame gets; without, all do.
+        """
         with self._lock:
             self._place(pose)
             with self._applied(options):
                 return [
-                    self._see(frame, self._view(camera, options, slot), aspect)
-                    for frame, camera in zip(frames, cameras, strict=True)
+                    self._see(frame, self._view(camera, options, slot), aspect, choose)
+                    for frame, camera, choose in itertools.zip_longest(frames, cameras, choices)
                 ]
 
     def view(self, camera: str | UserCamera, pose: Pose, options: VisualOptions, slot: int) -> View:
@@ -193,11 +216,13 @@ class Stage:
     def _place(self, pose: Pose) -> None:
         model, data = self.model, self._data
         model.body_pos[:], model.body_quat[:], data.qpos[:] = pose.body_pos, pose.body_quat, pose.qpos
+        if self._grid:
+            data.qpos[:] = np.round(pose.qpos / self._grid) * self._grid
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)  # cameras and lights may follow a body's centre of mass
         mujoco.mj_camlight(model, data)
         for site, knobs, is_on in self._burners:
-            model.site_group[site] = 0 if any(is_on(data.qpos[knob]) for knob in knobs) else _HIDDEN
+            self._site_groups[site] = 0 if any(is_on(pose.qpos[knob]) for knob in knobs) else HIDDEN
 
     def _view(self, camera: str | UserCamera, options: VisualOptions, slot: int) -> View:
         if isinstance(camera, UserCamera):
@@ -212,30 +237,54 @@ class Stage:
                 return view.shifted(options.cameras[key])
         return view
 
-    def _see(self, frame: mujoco.MjvScene, view: View, aspect: float) -> View:
+    def _see(
+        self, frame: mujoco.MjvScene, view: View, aspect: float, choose: Callable[[Sight], np.ndarray] | None
+    ) -> Sight:
         """Fill a frame through the model's first camera, which is put where the view is and back."""
         model, data = self.model, self._data
         before = data.cam_xpos[0].copy(), data.cam_xmat[0].copy(), model.cam_fovy[0].copy()
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = view.pos, view.mat.ravel(), view.fovy
-        seen = self._seen(view, aspect)
-        model.geom_group[:] = np.where(seen | self._always, self._groups, _HIDDEN)
+        seen, sight = self._sight(view, aspect)
+        drawn = sight.shown if choose is None else choose(sight)
+        model.geom_group[:] = np.where(drawn[: model.ngeom], self._groups, HIDDEN)
+        model.site_group[:] = np.where(drawn[model.ngeom :], self._site_groups, HIDDEN)
         # MuJoCo draws everything once more for each mirror, also for one outside the image.
-        model.mat_reflectance[:] = np.where(np.isin(np.arange(model.nmat), model.geom_matid[seen]), self._shine, 0)
+        materials = model.geom_matid[seen]
+        model.mat_reflectance[:] = 0
+        materials = materials[materials >= 0]
+        model.mat_reflectance[materials] = self._shine[materials]
         eye = mujoco.MjvCamera()
         eye.type, eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
         mujoco.mjv_updateScene(model, data, self._option, None, eye, mujoco.mjtCatBit.mjCAT_ALL, frame)
         # The sky fills the whole image first, which costs as much as all walls.
         frame.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = not self._walls.fill(data, view, aspect)
-        model.geom_group[:], model.mat_reflectance[:] = self._groups, self._shine
+        model.geom_group[:], model.site_group[:] = self._groups, self._site_groups
+        model.mat_reflectance[:] = self._shine
         data.cam_xpos[0], data.cam_xmat[0], model.cam_fovy[0] = before
-        return view
+        return sight
 
-    def _seen(self, view: View, aspect: float) -> np.ndarray:
-        """Geoms that are in the image, or in a mirror that is, bool [ngeom]."""
-        seen = self._boxes.in_sight(self._data, _Cone.of_image(view, aspect, self.clip_planes[0]))
-        for cone in self._mirrors.cones(self._data, view, seen):
-            seen = seen | self._boxes.in_sight(self._data, cone)
-        return seen
+    def _sight(self, view: View, aspect: float) -> tuple[np.ndarray, Sight]:
+        """Geoms that are in the image, or in a mirror that is, bool [ngeom], and what there is to see."""
+        model, data = self.model, self._data
+        in_image = self.boxes.in_sight(data, Cone.of_image(view, aspect, self.clip_planes[0]))
+        mirrored = {geom: self.boxes.in_sight(data, cone) for geom, cone in self._mirrors.cones(data, view, in_image)}
+        seen = np.any([in_image, *mirrored.values()], axis=0)
+        mirror = self._mirrors.first(seen)
+        # Where MuJoCo's mirror is outside the image or seen from behind, nothing is reflected: it draws no other.
+        mirror = mirror if mirror in mirrored else -1
+        reflected = mirrored.get(mirror, np.zeros_like(seen))
+        shine = float(self._shine[model.geom_matid[mirror]]) if mirror >= 0 else 0.0
+        there = np.isin(self._groups, DRAWN_GROUPS)
+        sites = self._option.sitegroup[np.clip(self._site_groups, 0, mujoco.mjNGROUP - 1)].astype(bool)
+        masks = [
+            np.concatenate([there & (mask | self._always), sites]) & self._visible
+            for mask in (np.ones_like(seen), seen, in_image, reflected)
+        ]
+        poses = np.concatenate(
+            [np.concatenate([data.geom_xpos, data.site_xpos]), np.concatenate([data.geom_xmat, data.site_xmat])], axis=1
+        )
+        panes = (masks[1] & self._panes).any() or self._mirrors.from_behind(data, view, masks[1])
+        return seen, Sight(view, *masks, mirror=mirror, reflectance=shine, poses=poses, is_opaque=not panes)
 
     @contextmanager
     def _applied(self, options: VisualOptions) -> Iterator[None]:
@@ -259,7 +308,7 @@ class Stage:
             row = _id(model, mujoco.mjtObj.mjOBJ_MATERIAL, material)
             model.mat_texid[row, _RGB] = _id(model, mujoco.mjtObj.mjOBJ_TEXTURE, texture)
             # Skins fit the texture that was there; a cube texture would not fit them.
-            self._groups[self._skins & (model.geom_matid == row)] = _HIDDEN
+            self._groups[self._skins & (model.geom_matid == row)] = HIDDEN
         try:
             yield
         finally:
@@ -287,117 +336,6 @@ class Stage:
         if kind == mujoco.mjtObj.mjOBJ_SITE:
             return int(self._instance_of_body[self.model.site_bodyid[index]])
         return 0
-
-
-@dataclass(frozen=True)
-class _Cone:
-    """The region that is visible from a point: points p with ``sides @ (p - apex) <= bounds``, world frame.
-
-    The shapes are [S, 3], [3] and [S].
-    """
-
-    sides: np.ndarray
-    apex: np.ndarray
-    bounds: np.ndarray
-
-    @classmethod
-    def of_image(cls, view: View, aspect: float, near: float) -> _Cone:
-        """The region beyond the near plane of a camera and between the sides of its image."""
-        return cls(_side_normals(view, aspect), view.pos, np.array([-near, 0.0, 0.0, 0.0, 0.0]))
-
-
-class _Boxes:
-    """The bounding boxes of a model's geoms, for culling what a camera cannot see.
-
-    MuJoCo draws everything, and what lies outside the image costs more than what is in it: software GL clips triangles
-    one by one.
-    """
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._center, self._half = model.geom_aabb[:, :3].copy(), model.geom_aabb[:, 3:].copy()
-        # Planes are infinite; MuJoCo gives them the radius 0.
-        self._endless = model.geom_rbound == 0
-
-    def in_sight(self, data: mujoco.MjData, cone: _Cone) -> np.ndarray:
-        """Geoms whose box is not wholly outside one side of a cone, bool [ngeom]."""
-        turn = data.geom_xmat.reshape(-1, 3, 3)
-        center = data.geom_xpos + np.einsum("nij,nj->ni", turn, self._center)
-        reach = np.einsum("nk,snk->sn", self._half, np.abs(np.einsum("si,nij->snj", cone.sides, turn)))
-        distance = cone.sides @ (center - cone.apex).T
-        return self._endless | (distance - reach <= cone.bounds[:, None]).all(axis=0)
-
-
-class _Mirrors:
-    """The reflecting planes and boxes of a model; MuJoCo reflects in the upper side of a box."""
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE))
-        shine = np.where(model.geom_matid >= 0, model.mat_reflectance[model.geom_matid], 0.0)
-        self._geoms = np.flatnonzero(flat & (shine > 0) & np.isin(model.geom_group, DRAWN_GROUPS))
-        self._half = model.geom_size[self._geoms].copy()
-        self._half[model.geom_type[self._geoms] == mujoco.mjtGeom.mjGEOM_PLANE, 2] = 0
-
-    def cones(self, data: mujoco.MjData, view: View, seen: np.ndarray) -> Iterator[_Cone]:
-        """What the visible mirrors show: the region seen from the camera's mirror image through the mirror's edges."""
-        for geom, half in zip(self._geoms, self._half, strict=True):
-            turn = data.geom_xmat[geom].reshape(3, 3)
-            normal, middle = turn[:, 2], data.geom_xpos[geom] + turn[:, 2] * half[2]
-            height = normal @ (view.pos - middle)
-            if not seen[geom] or height <= 0:
-                continue
-            apex = view.pos - 2 * height * normal
-            sides, bounds = [-normal], [-height]
-            if (half[:2] > 0).all():  # otherwise the mirror is infinite
-                corners = middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half[:2] @ turn[:, :2].T
-                # Edges in turn around +z, seen from below it.
-                sides += list(np.cross(np.roll(corners, -1, axis=0) - apex, corners - apex))
-                bounds += [0.0] * 4
-            yield _Cone(np.array(sides), apex, np.array(bounds))
-
-
-class _Walls:
-    """The opaque, immovable boxes and planes of a model, for leaving out a sky that they hide."""
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE))
-        alpha = np.where(model.geom_matid >= 0, model.mat_rgba[model.geom_matid, 3], model.geom_rgba[:, 3])
-        still = model.body_weldid[model.geom_bodyid] == 0
-        self._geoms = np.flatnonzero(flat & still & np.isin(model.geom_group, DRAWN_GROUPS) & (alpha == 1))
-        half = model.geom_size[self._geoms].copy()
-        planes = model.geom_type[self._geoms] == mujoco.mjtGeom.mjGEOM_PLANE
-        # A plane whose size is 0 is infinite; its third size is the spacing of MuJoCo's grid.
-        half[planes] = np.where(half[planes] > 0, half[planes], np.inf)
-        half[planes, 2] = 0
-        self._half, self._is_plane = half, planes
-
-    def fill(self, data: mujoco.MjData, view: View, aspect: float) -> bool:
-        """Whether all of a grid of rays over the image, its corners included, end at a wall."""
-        rays = _image_rays(view, aspect)
-        turn = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
-        eye = np.einsum("nji,nj->ni", turn, view.pos - data.geom_xpos[self._geoms])[:, None]
-        way = rays @ turn
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = np.stack([(-self._half[:, None] - eye) / way, (self._half[:, None] - eye) / way])
-        # Rays along a face give NaN, which fmin and fmax ignore.
-        first, last = np.fmax.reduce(ends.min(axis=0), axis=-1), np.fmin.reduce(ends.max(axis=0), axis=-1)
-        # GL draws front faces only: no box from inside, no plane from below.
-        front = ~self._is_plane[:, None] | (eye[..., 2] > 0)
-        return bool(((first <= last) & (first > 0) & front).any(axis=0).all())
-
-
-def _image_rays(view: View, aspect: float) -> np.ndarray:
-    """Directions from the camera to a grid of points over its image, world frame, [rays, 3]."""
-    up = np.tan(np.deg2rad(view.fovy) / 2) * np.linspace(-1, 1, _GRID)
-    x, y = np.meshgrid(up * aspect, up)
-    return np.stack([x.ravel(), y.ravel(), -np.ones(x.size)], axis=1) @ view.mat.T
-
-
-def _side_normals(view: View, aspect: float) -> np.ndarray:
-    """Outward unit normals of near plane, left, right, bottom and top of what a camera sees, world frame, [5, 3]."""
-    up = np.tan(np.deg2rad(view.fovy) / 2)
-    side = up * aspect
-    own = np.array([[0, 0, 1], [-1, 0, side], [1, 0, side], [0, -1, up], [0, 1, up]], float)
-    return (own / np.linalg.norm(own, axis=1, keepdims=True)) @ view.mat.T
 
 
 def instances_of_bodies(model: mujoco.MjModel, scene: Scene) -> np.ndarray:
@@ -431,6 +369,13 @@ def hinges(model: mujoco.MjModel, entity: Entity) -> list[int]:
 def _passes(test: catalog.JointTest) -> Callable[[float], bool]:
     sign, bound, inclusive = test.sign_form()
     return lambda qpos: sign * qpos >= bound if inclusive else sign * qpos > bound
+
+
+def _alpha(model: mujoco.MjModel, rgba: np.ndarray, material: np.ndarray) -> np.ndarray:
+    """The opacity that MuJoCo draws geoms or sites with: the material's unless they have their own colour."""
+    is_set = (rgba != _UNSET).any(axis=1) | (material < 0)
+    own = rgba[:, 3]
+    return np.where(is_set, own, model.mat_rgba[material, 3]) if model.nmat else own.copy()
 
 
 def _names(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from vecenv.libero.render import drawing, surfaces
+from vecenv.libero.render import culling, drawing, surfaces
 from vecenv.libero.render.surfaces import RGB_ROLE, Corners, Look
 from vecenv.libero.scene import catalog
 from vecenv.libero.scene.scene import Scene
@@ -114,7 +114,7 @@ class _Flattening:
 
     def _drawn_geoms(self) -> list[int]:
         model = self._model
-        groups = np.isin(model.geom_group, drawing.DRAWN_GROUPS)
+        groups = np.isin(model.geom_group, culling.DRAWN_GROUPS)
         return [geom for geom in np.flatnonzero(groups).tolist() if surfaces.drawn_color(model, geom)[3] > 0]
 
     def _collect_palette(self) -> None:

@@ -17,21 +17,22 @@ import functools
 import importlib
 import itertools
 import os
-import queue
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
 
 from vecenv.errors import SimulationError
+from vecenv.libero.render.composite import LAYER_MEMORY, Compositor, Layers, Picture, is_worthwhile
+from vecenv.libero.render.culling import View
 from vecenv.libero.render.displays import GlContext, egl_context
-from vecenv.libero.render.drawing import Pose, Stage, View, camera_view
+from vecenv.libero.render.drawing import Pose, Stage, camera_view
 from vecenv.libero.render.options import RenderError, UserCamera, VisualOptions
+from vecenv.libero.render.worker import Worker
 from vecenv.observations import CameraView
 from vecenv.util.cores import usable_cores
 
@@ -44,8 +45,6 @@ _VARIABLE = "MUJOCO_GL"
 _ATTEMPTS = 2
 _AS_CODES = (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR)
 
-# A future, a function and its arguments.
-_Call = tuple[Future[object], Callable[..., object], tuple[object, ...]]
 # EGL's display is opened with the first context, by one thread at a time.
 _opening = threading.Lock()
 
@@ -165,6 +164,8 @@ class GlRenderer:
         height, width: of the images, pixels.
         num_threads: rendering threads; None for one per core. If the driver gives fewer contexts, fewer threads run.
         gl: ``"egl"``, ``"osmesa"`` or None (``choose``).
+        layer_memory: for stored images of what stands still (``vecenv.libero.render.composite``), bytes; with 0 every
+            image is drawn whole.
 
     Raises:
         GlError: no GL is available.
@@ -178,14 +179,16 @@ class GlRenderer:
         width: int = 256,
         num_threads: int | None = None,
         gl: str | None = None,
+        layer_memory: int = LAYER_MEMORY,
     ) -> None:
         self.stages, self.height, self.width = tuple(stages), height, width
         self.gl = choose(gl)
         self._calls = threading.Lock()
         self._threads: list[_Thread] = []
         failures: list[GlError] = []
-        for _ in range(num_threads or usable_cores()):
-            thread = _Thread(_Painter(self.stages, self.gl, height, width))
+        count = num_threads or usable_cores()
+        for _ in range(count):
+            thread = _Thread(_Painter(self.stages, self.gl, height, width, layer_memory // count))
             try:
                 thread.run(thread.painter.open).result()
                 self._threads.append(thread)
@@ -331,25 +334,29 @@ def _run_tasks(painter: _Painter, job: _Job, shares: Sequence[deque[_Task]], own
 class _Painter:
     """One thread's GL context and its uploaded scenes; only that thread may call the methods."""
 
-    def __init__(self, stages: Sequence[Stage], gl: str, height: int, width: int) -> None:
+    def __init__(self, stages: Sequence[Stage], gl: str, height: int, width: int, memory: int) -> None:
         self._stages, self._gl = stages, gl
         self._rect, self._aspect = mujoco.MjrRect(0, 0, width, height), width / height
         self._pixels = np.empty((height, width, 3), np.uint8)
         self._depth = np.empty((height, width), np.float32)
         self._window: GlContext | None = None
         self._contexts: dict[int, mujoco.MjrContext] = {}
+        self._memory, self._composes = memory, False
+        self._layers: Layers | None = None
+        self._compositors: dict[int, Compositor] = {}
         self._frames: dict[int, list[mujoco.MjvScene]] = {}
 
     def open(self) -> None:
         """Create the GL context."""
         self._window = open_context(self._gl, *self._depth.shape)
+        self._composes = self._memory > 0 and is_worthwhile()
 
     def close(self) -> None:
         """Free everything; errors are ignored, because what GL has lost cannot be freed."""
         for context in self._contexts.values():
             with contextlib.suppress(Exception):
                 context.free()
-        self._contexts, self._frames = {}, {}
+        self._contexts, self._frames, self._compositors, self._layers = {}, {}, {}, None
         if self._window is not None:
             with contextlib.suppress(Exception):
                 self._window.free()
@@ -376,21 +383,46 @@ class _Painter:
         stage, context = self._stages[shot.stage], self._context(shot.stage)
         frames = self._frames_for(shot.stage, len(task.cameras))
         cameras = [job.cameras[index] for index in task.cameras]
-        views = stage.fill(frames, cameras, shot.pose, shot.options, slot=task.slot, aspect=self._aspect)
-        for frame, camera, view in zip(frames, cameras, views, strict=True):
-            name = camera_name(camera)
-            job.views[name][task.slot] = view
-            self._shoot(stage, context, frame, name, job, task.slot)
+        names = [camera_name(camera) for camera in cameras]
+        pictures = self._pictures(task.slot, names, shot, job.wanted)
+        sights = stage.fill(
+            frames, cameras, shot.pose, shot.options, slot=task.slot, aspect=self._aspect,
+            choices=[picture.choose for picture in pictures],
+        )  # fmt: skip
+        for frame, name, sight, picture in itertools.zip_longest(frames, names, sights, pictures):
+            job.views[name][task.slot] = sight.view
+            self._shoot(stage, context, frame, name, job, task.slot, picture)
+
+    def _pictures(self, slot: int, names: Sequence[str], shot: Shot, wanted: Wanted) -> list[Picture]:
+        """The images of a slot that are composed of layers; none if MuJoCo draws them."""
+        if not self._composes or wanted != Wanted():
+            return []
+        if shot.stage not in self._compositors:
+            self._layers = self._layers or Layers(*self._depth.shape, self._memory)
+            self._compositors[shot.stage] = Compositor(
+                self._stages[shot.stage], self._context(shot.stage), self._layers, *self._depth.shape
+            )
+        return [self._compositors[shot.stage].picture(slot, name, shot.options) for name in names]
 
     def _shoot(
-        self, stage: Stage, context: mujoco.MjrContext, frame: mujoco.MjvScene, name: str, job: _Job, slot: int
+        self,
+        stage: Stage,
+        context: mujoco.MjrContext,
+        frame: mujoco.MjvScene,
+        name: str,
+        job: _Job,
+        slot: int,
+        picture: Picture | None,
     ) -> None:
         """Draw one frame and deliver its images, turned by 180 degrees against GL's rows from the bottom."""
         if job.wanted.rgb:
-            mujoco.mjr_render(self._rect, frame, context)
-            mujoco.mjr_readPixels(self._pixels, None, self._rect, context)
+            if picture is None:
+                mujoco.mjr_render(self._rect, frame, context)
+                mujoco.mjr_readPixels(self._pixels, None, self._rect, context)
+                job.rgb[name][slot] = self._pixels[::-1, ::-1]
+            else:
+                picture.draw(frame, job.rgb[name][slot])
             _check()
-            job.rgb[name][slot] = self._pixels[::-1, ::-1]
         if job.wanted.depth or job.wanted.segmentation:
             codes = self._codes(frame, context)
             if job.wanted.depth:
@@ -408,8 +440,10 @@ class _Painter:
         return self._pixels.astype(np.int32) @ np.array([1, 1 << 8, 1 << 16], np.int32)
 
     def _context(self, stage: int) -> mujoco.MjrContext:
+        """The scene's context; from then on its framebuffer is drawn into, which ``mjr_render`` does not see to."""
         if stage not in self._contexts:
             self._contexts[stage] = self._stages[stage].context(*self._depth.shape)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._contexts[stage])
         return self._contexts[stage]
 
     def _frames_for(self, stage: int, count: int) -> list[mujoco.MjvScene]:
@@ -430,38 +464,12 @@ def _metres(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     return (near * far / (near + depth.astype(float) * (far - near))).astype(np.float32)
 
 
-class _Thread:
-    """A thread that runs calls one after the other until it is stopped."""
+class _Thread(Worker):
+    """A thread with a painter, which only it uses."""
 
     def __init__(self, painter: _Painter) -> None:
+        super().__init__("vecenv-gl", painter.close)
         self.painter = painter
-        self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()
-        # A daemon thread: at exit, Python waits for other threads before a renderer can be closed.
-        self._thread = threading.Thread(target=self._loop, name="vecenv-gl", daemon=True)
-        self._thread.start()
-
-    def run(self, call: Callable[..., object], *arguments: object) -> Future[object]:
-        """Call in this thread."""
-        future: Future[object] = Future()
-        self._calls.put((future, call, arguments))
-        return future
-
-    def stop(self) -> None:
-        """Free the painter's resources and end the thread."""
-        self._calls.put(None)
-        self._thread.join()
-
-    def _loop(self) -> None:
-        while (call := self._calls.get()) is not None:
-            _answer(*call)
-        self.painter.close()
-
-
-def _answer(future: Future[object], call: Callable[..., object], arguments: Iterable[object]) -> None:
-    try:
-        future.set_result(call(*arguments))
-    except BaseException as error:
-        future.set_exception(error)
 
 
 _live: weakref.WeakSet[GlRenderer] = weakref.WeakSet()

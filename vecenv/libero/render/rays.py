@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 
 from vecenv.libero.physics.base import Shown
 from vecenv.libero.physics.mjx.options import jit
-from vecenv.libero.render.drawing import View
+from vecenv.libero.render.culling import View
 from vecenv.libero.render.gl import Wanted
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.render.ray_poses import BodyPoses
