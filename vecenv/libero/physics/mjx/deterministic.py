@@ -14,12 +14,13 @@ originals. In a step of LIBERO's scenes the order of threads matters in these pl
 * **Constraint forces, the squared length of the gradient, and the Hessian** of the solver: rows add to coordinates. How
   many threads share the rows also depends on the number of worlds. Here terms are added in fixed point.
 
-Everything else is computed by one thread, or by one block of threads of a fixed size, from one world alone. Two places
-need nothing: the number of contacts that a contact sensor finds is an integer, and GJK's working memory is as large as
-the memory of contacts. The Hessian is kept in the sparse form for scenes of any size, as the dense one has sums of its
-own.
+Everything else in MuJoCo Warp is computed by one thread, or by one block of threads of a fixed size, from one world
+alone. Two places need nothing: the number of contacts that a contact sensor finds is an integer, and GJK's working
+memory is as large as the memory of contacts. The Hessian is kept in the sparse form for scenes of any size, as the
+dense one has sums of its own.
 
-Contacts, rows and the solver's problem are the same with and without the mark up to the rounding of sums.
+What XLA computes between the steps, such as the controller, is in ``blocks``. Contacts, rows and the solver's problem
+are the same with and without the mark up to the rounding of sums.
 
 What vecenv's scenes do not have is refused: equality constraints, tendons, flexible bodies, ball joints with limits,
 gravity compensation, adhesion, sleeping, pyramidal cones, solvers other than Newton's.
@@ -91,6 +92,7 @@ def _not_supported(model: mujoco.MjModel) -> dict[str, bool]:
         "tendons": model.ntendon > 0,
         "flexible bodies": model.nflex > 0,
         "ball joints with limits": bool(np.any(model.jnt_limited[ball])),
+        "adhesion": bool(np.any(model.geom_adhesion)) or bool(np.any(model.pair_adhesion)),
         "gravity compensation": bool(np.any(model.body_gravcomp)),
         "actuators of anything but joints": bool(np.any(model.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT)),
         "two actuators of one joint": len(np.unique(model.actuator_trnid[:, 0])) < model.nu,
