@@ -91,8 +91,9 @@ class LiberoConfig:
         arrays: ``"numpy"``, or ``"jax"``: verdicts, proprioception, states and images are JAX arrays on the default
             device, of 32 bits unless x64 is on; images stay where rays made them. Actions and states may be given as
             JAX arrays in both cases. ``done``, ``placement`` and ``observe_objects`` are NumPy's in both.
-        scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and no LIBERO
-            or robosuite files are needed. None for the installed packages.
+        scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and with
+            ``vecenv compile --images`` what images show, so that no LIBERO or robosuite files are needed. None for the
+            installed packages.
         waypoint: tolerances and speeds of ``step_ee_pose`` and ``step_waypoints``; also a mapping of its fields.
     """
 

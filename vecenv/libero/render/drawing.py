@@ -87,7 +87,55 @@ class Sight:
     is_opaque: bool
 
 
-class Stage:
+class Viewpoints:
+    """The cameras of a scene, which threads pose in turns.
+
+    Args:
+        model: any model of the scene; nothing else may use it.
+
+    Attributes:
+        model: the model.
+        cameras: names of its cameras.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = model
+        self.cameras = _names(model, _CAMERA, model.ncam)
+        self._data = mujoco.MjData(model)
+        self._lock = threading.Lock()
+
+    def view(self, camera: str | UserCamera, pose: Pose, options: VisualOptions, slot: int) -> View:
+        """Where a camera of a slot is."""
+        with self._lock:
+            self._place(pose)
+            return self._view(camera, options, slot)
+
+    def _place(self, pose: Pose) -> None:
+        model, data = self.model, self._data
+        model.body_pos[:], model.body_quat[:], data.qpos[:] = pose.body_pos, pose.body_quat, self._shown(pose.qpos)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)  # cameras and lights may follow a body's centre of mass
+        mujoco.mj_camlight(model, data)
+
+    def _shown(self, qpos: np.ndarray) -> np.ndarray:
+        """The joint positions that are drawn in place of some."""
+        return qpos
+
+    def _view(self, camera: str | UserCamera, options: VisualOptions, slot: int) -> View:
+        if isinstance(camera, UserCamera):
+            name, view = camera.name, View(*camera.in_slot(slot))
+        else:
+            name = ALIASES.get(camera, camera)
+            index = self.cameras.index(name)
+            mat = self._data.cam_xmat[index].reshape(3, 3).copy()
+            view = View(self._data.cam_xpos[index].copy(), mat, float(self.model.cam_fovy[index]))
+        for key in (name, *(alias for alias, real in ALIASES.items() if real == name)):
+            if key in options.cameras:
+                return view.shifted(options.cameras[key])
+        return view
+
+
+class Stage(Viewpoints):
     """The visual model of a scene, which threads pose in turns.
 
     Args:
@@ -97,20 +145,17 @@ class Stage:
 
     Attributes:
         model: the visual model.
-        cameras: names of its cameras.
         instances: the names that segmentation images index; "" (index 0) is everything else: table, floor, walls.
         boxes: the bounding boxes of its items.
         has_shadows: whether a light casts shadows.
     """
 
     def __init__(self, scene: Scene, grid: float = 0.0) -> None:
-        self.model = model = scene.model
-        self.cameras = _names(model, _CAMERA, model.ncam)
+        super().__init__(scene.model)
+        model = self.model
         self.instances = ("", ROBOT, *scene.entities)
         self._instance_of_body = instances_of_bodies(model, scene)
-        self._data = mujoco.MjData(model)
         self._grid = grid
-        self._lock = threading.Lock()
         # Only meshes are culled. Other shapes have few triangles, and Mesa's software driver sometimes smears a wall
         # behind the camera into the image: upstream's images have that, so these must too.
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
@@ -193,12 +238,6 @@ class Stage:
                     for frame, camera, choose in itertools.zip_longest(frames, cameras, choices)
                 ]
 
-    def view(self, camera: str | UserCamera, pose: Pose, options: VisualOptions, slot: int) -> View:
-        """Where a camera of a slot is."""
-        with self._lock:
-            self._place(pose)
-            return self._view(camera, options, slot)
-
     def segment(self, frame: mujoco.MjvScene, codes: np.ndarray) -> np.ndarray:
         """Instances, indices into ``instances``, int16 [H, W], of MuJoCo's segment codes [H, W] of a frame."""
         table = np.zeros(frame.ngeom + 2, np.int16)
@@ -214,28 +253,12 @@ class Stage:
         return visual.znear * self.model.stat.extent, visual.zfar * self.model.stat.extent
 
     def _place(self, pose: Pose) -> None:
-        model, data = self.model, self._data
-        model.body_pos[:], model.body_quat[:], data.qpos[:] = pose.body_pos, pose.body_quat, pose.qpos
-        if self._grid:
-            data.qpos[:] = np.round(pose.qpos / self._grid) * self._grid
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)  # cameras and lights may follow a body's centre of mass
-        mujoco.mj_camlight(model, data)
+        super()._place(pose)
         for site, knobs, is_on in self._burners:
             self._site_groups[site] = 0 if any(is_on(pose.qpos[knob]) for knob in knobs) else HIDDEN
 
-    def _view(self, camera: str | UserCamera, options: VisualOptions, slot: int) -> View:
-        if isinstance(camera, UserCamera):
-            name, view = camera.name, View(*camera.in_slot(slot))
-        else:
-            name = ALIASES.get(camera, camera)
-            index = self.cameras.index(name)
-            mat = self._data.cam_xmat[index].reshape(3, 3).copy()
-            view = View(self._data.cam_xpos[index].copy(), mat, float(self.model.cam_fovy[index]))
-        for key in (name, *(alias for alias, real in ALIASES.items() if real == name)):
-            if key in options.cameras:
-                return view.shifted(options.cameras[key])
-        return view
+    def _shown(self, qpos: np.ndarray) -> np.ndarray:
+        return np.round(qpos / self._grid) * self._grid if self._grid else qpos
 
     def _see(
         self, frame: mujoco.MjvScene, view: View, aspect: float, choose: Callable[[Sight], np.ndarray] | None

@@ -23,7 +23,7 @@ from vecenv.libero.render.gl import Wanted
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.render.ray_poses import BodyPoses
 from vecenv.libero.render.raytrace import RayTracer, Style
-from vecenv.libero.render.scenery import installed_scenery
+from vecenv.libero.render.sources import InstalledVisuals, VisualSource
 from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.util.devices import Spread
 
@@ -50,10 +50,11 @@ class RayRenderer:
 
     Args:
         config: sizes, level of detail and user cameras.
+        source: where sceneries come from; None for the installed packages.
     """
 
-    def __init__(self, config: RenderConfig) -> None:
-        self._config = config
+    def __init__(self, config: RenderConfig, source: VisualSource | None = None) -> None:
+        self._config, self._source = config, source or InstalledVisuals()
         self._user_cameras = {camera.name: camera for camera in config.cameras}
         self._programs: dict[_Key, tuple[RayTracer, Callable[..., tuple[jax.Array, ...]]]] = {}
 
@@ -110,7 +111,7 @@ class RayRenderer:
         """The compiled call of a scene: poses of all its worlds and which of them to render -> images by camera."""
         key = (problem.scene_key(), cameras, wanted, mesh)
         if key not in self._programs:
-            scenery = installed_scenery(problem, self._config.lod, self._config.colors)
+            scenery = self._source.scenery(problem, level=self._config.lod, colors=self._config.colors)
             scenery.check(model)
             tracer = RayTracer(
                 scenery,

@@ -22,6 +22,8 @@ import warp as wp
 from jaxtyping import PyTree
 from mujoco import mjx
 
+from vecenv.libero.physics.mjx import kernels
+from vecenv.libero.physics.mjx.options import remember_compilations
 from vecenv.libero.render import ray_passes
 from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderError
 from vecenv.libero.render.ray_kernel import make_kernel
@@ -123,6 +125,8 @@ class RayTracer:
         self._model = model = scenery.model
         self._camera_ids = [0 if name is None else _camera(model, name) for name in cameras]
         self._is_free = np.array([name is None for name in cameras])
+        remember_compilations()
+        kernels.install()
         self._put = mjx.put_model(model, impl="warp")
         sizes = self._put._impl.block_dim.__class__(render=block_dim)
         self._put = self._put.tree_replace({"_impl.block_dim": sizes}).replace(**_lamps(model))
