@@ -279,6 +279,8 @@ def _triangle(size: int) -> int:
 
 def _slots(nworld: int) -> int:
     """Groups of threads that share the rows of a world; the sums do not depend on it."""
+    if wp.get_device().is_cpu:  # where threads run one after the other
+        return 1
     return min(max(_GROUPS // nworld, _FEWEST_SLOTS), _MOST_SLOTS)
 
 
