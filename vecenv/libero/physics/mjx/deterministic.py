@@ -191,7 +191,7 @@ def _order_rows(m: Any, d: Any) -> None:
     """Put the rows of friction and limits in order, and give rows to contacts."""
     efc = d.efc
     rows = min(d.njmax, m.nv + m.jnt_limited_slide_hinge_adr.size)
-    names = wp.empty((d.nworld, rows), dtype=wp.vec3i)
+    names = wp.empty((d.nworld, rows), dtype=wp.vec3i)  # pyright: ignore[reportArgumentType]
     values = wp.empty((d.nworld, rows, kernels.ROW_VALUES), dtype=float)
     entries = [efc.J_rowadr, efc.J_colind, efc.J]
     fields = [efc.pos, efc.margin, efc.D, efc.vel, efc.aref, efc.frictionloss]
@@ -211,7 +211,7 @@ def _order_rows(m: Any, d: Any) -> None:
     contact = d.contact
     counts = wp.zeros(d.nworld, dtype=int)
     contacts, sizes = (wp.empty((d.nworld, d.njmax), dtype=int) for _ in range(2))
-    keys = wp.empty((d.nworld, d.njmax), dtype=wp.int64)
+    keys = wp.empty((d.nworld, d.njmax), dtype=wp.int64)  # pyright: ignore[reportArgumentType]
     bodies = [m.body_weldid, m.body_dofnum, m.body_dofadr, m.dof_parentid, m.geom_bodyid]
     found = [contact.dist, contact.dim, contact.includemargin, contact.worldid, contact.geom]
     wp.launch(
@@ -279,6 +279,8 @@ def _triangle(size: int) -> int:
 
 def _slots(nworld: int) -> int:
     """Groups of threads that share the rows of a world; the sums do not depend on it."""
+    if wp.get_device().is_cpu:  # where threads run one after the other
+        return 1
     return min(max(_GROUPS // nworld, _FEWEST_SLOTS), _MOST_SLOTS)
 
 
