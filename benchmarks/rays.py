@@ -1,10 +1,12 @@
 """Ray-traced images against GL's of the same states, in every scene of LIBERO: the table of docs/rendering.md.
 
     python benchmarks/rays.py [--scenes libero_10/3 ...] [--samples 2] [--no-antialias] [--references FOLDER]
+    python benchmarks/rays.py --table
 
 One episode at its start and after eight random actions, both cameras, 256 x 256. GL draws every triangle
-(``lod="original"``), rays meet those of the sceneries' default, ``"fast"``; both with ``colors="current"``. A row has the
-lower PSNR of each camera's two images, and the instance of 500 pixels or more whose mask overlaps least in one image.
+(``lod="original"``), rays meet those of the sceneries' default, ``"fast"``; both with ``colors="current"``. A row has
+the lower PSNR of each camera's two images, and the instance of 500 pixels or more whose mask overlaps least in one
+image.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from common import report
+from common import RESULTS, ROOT, fill_table, report
 from support.images import psnr
 
 import vecenv
@@ -80,7 +82,8 @@ def kept_reference(scene: str, folder: Path | None) -> dict[str, np.ndarray]:
         return reference(scene)
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(path, **reference(scene))
+        arrays: dict[str, Any] = reference(scene)
+        np.savez_compressed(path, **arrays)
     with np.load(path, allow_pickle=False) as file:
         return dict(file)
 
@@ -93,7 +96,8 @@ def row(scene: str, folder: Path | None, options: dict[str, Any]) -> dict[str, A
     tracer = RayTracer(scenery, height=SIZE, width=SIZE, segmentation=True, **options)
     begun = time.process_time()
     seen = jax.jit(jax.vmap(tracer.look))(drawn["xpos"], drawn["xquat"], drawn["qpos"])
-    assert seen.rgb is not None and seen.segmentation is not None
+    assert seen.rgb is not None
+    assert seen.segmentation is not None
     rgb, masks = np.asarray(seen.rgb), np.asarray(seen.segmentation)
     found: dict[str, Any] = {"scene": scene}
     for camera, name in enumerate(POLICY_CAMERAS):
@@ -122,7 +126,11 @@ def main() -> None:
     parser.add_argument("--antialias", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--references", type=Path, help="folder to keep GL's images in, and to read them from")
     parser.add_argument("--out", default="rays", help="name of the result file")
+    parser.add_argument("--table", action="store_true", help="put the rows of the result file into docs/rendering.md")
     chosen = parser.parse_args()
+    if chosen.table:
+        print(fill_table("rays", RESULTS / f"{chosen.out}.json", ROOT / "docs" / "rendering.md"))
+        return
     every = scenes()
     names = chosen.scenes or every
     if unknown := [name for name in names if name not in every]:

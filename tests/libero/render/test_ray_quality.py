@@ -55,7 +55,7 @@ def test_only_pixels_that_differ_from_their_neighbours_get_more_rays(tile: tuple
 
 
 def test_pixels_at_an_edge_show_the_mean_of_four_points() -> None:
-    """A white pane on black, its edge a little right of the middle of a pixel: two of the points where GL samples are beyond."""
+    """A white pane on black, its edge a little right of the middle of a pixel: two of GL's four points are beyond."""
     side, fovy = 32, 40.0
     half = np.tan(np.deg2rad(fovy) / 2)
     edge = (4.5 / 8 / side) * 2 * half  # of the pixel right of the middle, 1 m away
@@ -118,7 +118,8 @@ def test_textures_far_away_are_averaged_as_in_gl(thing: str, side: int) -> None:
     )
     found = one_thing(assets, f'{thing} material="floor"')
     seen, drawn = small_seen(found, antialias=False).rgb[0], small_drawn(found)[0]
-    assert psnr(seen[66:], drawn[66:]) > 30
+    below = slice(72, None)  # the horizon, and where the box ends
+    assert psnr(seen[below], drawn[below]) > 38  # 15 to 20 without mipmaps
 
 
 def test_samples_for_every_pixel_are_not_antialiased_again() -> None:

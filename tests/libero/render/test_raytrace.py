@@ -179,7 +179,7 @@ def test_no_gl_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @needs_gl
 @pytest.mark.parametrize("reflectance", [{}, {"plate": 0.6}, {"floor": 0.3}])
-@pytest.mark.parametrize(("samples", "least"), [(1, 27), (2, 30.5)])
+@pytest.mark.parametrize(("samples", "least"), [(1, 34), (2, 30.5)])
 def test_shapes_light_panes_and_mirrors_are_those_of_gl(
     reflectance: dict[str, float], samples: int, least: float
 ) -> None:
@@ -307,7 +307,8 @@ def test_a_free_camera_sees_what_one_of_the_scene_sees_from_there() -> None:
 
 
 def test_light_is_scaled_for_each_world() -> None:
-    rays = RayTracer(small(), height=32, width=32, cameras=("front",))
+    # Without antialiasing: which pixels get more rays depends on all channels.
+    rays = RayTracer(small(), height=32, width=32, cameras=("front",), antialias=False)
     dark, red, bright = (
         small_look(rays, style_of(rays, options, ["front"], 0)).rgb.mean((0, 1, 2))
         for options in (VisualOptions(light=0.5), VisualOptions(light_color=(1, 0, 0)), VisualOptions())

@@ -5,6 +5,9 @@ read them. Arrays whose first index is ``world % shape[0]`` hold one row for all
 MuJoCo Warp. Positions are in the world frame, in metres.
 """
 
+# Type checkers do not know that a struct is a class.
+# pyright: reportGeneralTypeIssues=false
+
 from __future__ import annotations
 
 import warp as wp
