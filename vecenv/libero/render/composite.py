@@ -191,8 +191,8 @@ class Compositor:
 
     def draw(self, frame: mujoco.MjvScene, framebuffer: int | None = None) -> None:
         """Let MuJoCo draw a frame, into its own framebuffer or another."""
-        if framebuffer is not None:
-            self._gl.BindFramebuffer(_FRAMEBUFFER, framebuffer)
+        # ``mjr_render`` draws into what is bound.
+        self._gl.BindFramebuffer(_FRAMEBUFFER, self._context.offFBO if framebuffer is None else framebuffer)
         mujoco.mjr_render(self.whole, frame, self._context)
 
     def prepare(self, frame: mujoco.MjvScene) -> None:
