@@ -83,8 +83,9 @@ class LiberoConfig:
             read.
         cameras: the cameras that observations show, in this order: names of the scene's cameras (``agentview``,
             ``wrist``, ``frontview``, ...) or of those that ``render`` adds; None for all of them.
-        scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and no LIBERO
-            or robosuite files are needed. None for the installed packages.
+        scenes: a folder that ``vecenv compile`` wrote: tasks, starts and compiled scenes come from there, and with
+            ``vecenv compile --images`` what images show, so that no LIBERO or robosuite files are needed. None for the
+            installed packages.
         waypoint: tolerances and speeds of ``step_ee_pose`` and ``step_waypoints``; also a mapping of its fields.
     """
 

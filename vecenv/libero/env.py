@@ -26,6 +26,7 @@ from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.build import make_physics
 from vecenv.libero.render.cameras import CameraRig, options_of
 from vecenv.libero.render.options import VisualOptions
+from vecenv.libero.render.sources import visual_source
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.libero.scene.scene import Scene
@@ -71,7 +72,7 @@ class LiberoEnv(SlotBatch):
         self.config = replace(config, **vars(self._rules))
         self._sources = tasks
         self._physics: Physics | None = None
-        self._cameras = CameraRig(self._rules.render, self.num_envs, config.cameras)
+        self._cameras = CameraRig(self._rules.render, self.num_envs, config.cameras, visual_source(config.scenes))
         self._place(placement)
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
@@ -246,8 +247,8 @@ class LiberoEnv(SlotBatch):
         Args:
             slots: draw the images of these slots only, bool [B] or indices; those of the others are black. None: all.
 
-        Reading one raises ``GlError`` where there is no GL, and ``SceneError`` or ``AssetsMissing`` where the meshes
-        and textures are missing.
+        Reading one raises ``GlError`` where there is no GL, ``SceneError`` or ``AssetsMissing`` where the meshes and
+        textures are missing, and ``ExportError`` where ``config.scenes`` was exported without such images.
         """
         self._check_live()
         groups = self.physics.groups

@@ -49,8 +49,9 @@ class FunctionalConfig:
             ``FunctionalLibero.layout``; and ``"pixels"``, ray-traced camera images, which need ``warp`` and make
             observations dictionaries.
         image_size: height and width of the images, pixels.
-        scenery: what there is to see, a file that ``vecenv.libero.render.scenery.Scenery.save`` wrote; None compiles it
-            from the installed packages.
+        scenery: what there is to see, a file that ``vecenv.libero.render.scenery.Scenery.save`` wrote; None takes it
+            from ``scenes``, which needs ``vecenv compile --images raytrace``, or compiles it from the installed
+            packages.
         colors: how textures look in images: ``"published"``, as in LIBERO's demonstrations, or ``"current"``, as the
             installed MuJoCo shows them; see ``vecenv.libero.render.options.RenderConfig``. A scenery file must have the
             same.

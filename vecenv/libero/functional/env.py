@@ -44,7 +44,8 @@ from vecenv.libero.functional.state import FunctionalState
 from vecenv.libero.physics.base import SUBSTEPS
 from vecenv.libero.physics.mjx import model as mjx_model
 from vecenv.libero.render.raytrace import RayTracer
-from vecenv.libero.render.scenery import Scenery, installed_scenery
+from vecenv.libero.render.scenery import Scenery
+from vecenv.libero.render.sources import visual_source
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.scene import Scene
@@ -240,6 +241,9 @@ def _with_cone(scene: Scene, cone: mujoco.mjtCone) -> Scene:
 def _tracer(scene: Scene, problem: Problem, config: FunctionalConfig) -> RayTracer:
     """Renders the agent's and the wrist's camera."""
     size, file, colors = config.image_size, config.scenery, config.colors
-    scenery = installed_scenery(problem, colors=colors) if file is None else Scenery.load(file)
+    if file is None:
+        scenery = visual_source(config.scenes).scenery(problem, level="fast", colors=colors)
+    else:
+        scenery = Scenery.load(file)
     scenery.check(scene.model, colors)
     return RayTracer(scenery, height=size, width=size)

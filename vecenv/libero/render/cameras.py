@@ -7,6 +7,7 @@ drawn before an image is read, and no GL library is loaded before that.
 
 from __future__ import annotations
 
+import copy
 import threading
 import time
 import weakref
@@ -19,17 +20,18 @@ import mujoco
 import numpy as np
 
 from vecenv.libero.physics.base import Group
-from vecenv.libero.render.colors import visual_scene
-from vecenv.libero.render.drawing import ROBOT, Pose, Stage, camera_view
+from vecenv.libero.render.drawing import ROBOT, Pose, Stage, Viewpoints, camera_view
 from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
-from vecenv.libero.scene.bddl import Problem, SceneKey
+from vecenv.libero.render.sources import InstalledVisuals, VisualSource
+from vecenv.libero.scene.bddl import Problem
 from vecenv.observations import CameraView, Rendered, choose_cameras
 
 if TYPE_CHECKING:
     from vecenv.libero.render.raytrace import RayRenderer
 
-_StageKey = tuple[SceneKey, str, str]
+_StageKey = tuple[object, str, str]
+_INSTALLED = InstalledVisuals()
 # How many stages stay compiled after the last environment that used them is closed; one takes 0.9 GB.
 _KEPT = 1
 _stages: weakref.WeakValueDictionary[_StageKey, Stage] = weakref.WeakValueDictionary()
@@ -37,16 +39,18 @@ _kept: OrderedDict[_StageKey, Stage] = OrderedDict()
 _compiling = threading.Lock()
 
 
-def stage_of(problem: Problem, physics: mujoco.MjModel, level: str, colors: str) -> Stage:
-    """The stage of a problem's scene; errors are those of ``compile_scene``.
+def stage_of(
+    problem: Problem, physics: mujoco.MjModel, level: str, colors: str, source: VisualSource = _INSTALLED
+) -> Stage:
+    """The stage of a problem's scene; errors are those of the source: ``compile_scene``'s, or ``ExportError``.
 
     Compiling takes seconds. A stage is reused while an environment uses it, and the last one used is kept.
     """
-    key = (problem.scene_key(), level, colors)
+    key = (source.key(problem), level, colors)
     with _compiling:
         stage = _stages.get(key)
         if stage is None:
-            scene = visual_scene(problem, colors, level)
+            scene = source.scene(problem, level=level, colors=colors)
             mujoco.mj_clearCache(mujoco.mj_getCache())  # 0.37 GB of decoded files
             stage = _stages[key] = Stage(scene)
         _kept[key] = stage
@@ -64,13 +68,20 @@ class CameraRig:
         config: how to render.
         num_envs: slots, B.
         chosen: the cameras that captures show; None for all.
+        source: where what is drawn comes from.
 
     Attributes:
         seconds: time spent rendering so far.
     """
 
-    def __init__(self, config: RenderConfig, num_envs: int, chosen: Sequence[str] | None = None) -> None:
-        self.config, self._chosen = config, chosen
+    def __init__(
+        self,
+        config: RenderConfig,
+        num_envs: int,
+        chosen: Sequence[str] | None = None,
+        source: VisualSource = _INSTALLED,
+    ) -> None:
+        self.config, self._chosen, self._source = config, chosen, source
         self.options: list[VisualOptions] = [VisualOptions()] * num_envs
         self._renderer: GlRenderer | None = None
         self._rays: RayRenderer | None = None
@@ -110,7 +121,8 @@ class CameraRig:
         if self._closed:
             raise GlError("the environment is closed: images must be read before")
         pairs = zip(problems, models, strict=True)
-        self._stages = [stage_of(problem, model, self.config.lod, self.config.colors) for problem, model in pairs]
+        look = self.config.lod, self.config.colors, self._source
+        self._stages = [stage_of(problem, model, *look) for problem, model in pairs]
         return self._stages
 
     def renderer(self, stages: Sequence[Stage]) -> GlRenderer:
@@ -141,7 +153,7 @@ class CameraRig:
         if self._rays is None:
             from vecenv.libero.render.raytrace import RayRenderer  # needs the extra `warp`
 
-            self._rays = RayRenderer(self.config)
+            self._rays = RayRenderer(self.config, self._source)
         return self._rays
 
     def close(self) -> None:
@@ -219,7 +231,12 @@ class Capture:
         return every
 
     def _views(self, names: Sequence[str]) -> dict[str, CameraView]:
-        stages, config = self._rig.stages(self._problems, self._models), self._rig.config
+        config = self._rig.config
+        stages: Sequence[Viewpoints]
+        if config.engine == "raytrace":  # needs no visual model for this
+            stages = [Viewpoints(copy.copy(model)) for model in self._models]
+        else:
+            stages = self._rig.stages(self._problems, self._models)
         return {
             name: camera_view(
                 [

@@ -79,7 +79,51 @@ def camera_view(views: Sequence[View], height: int, width: int) -> CameraView:
     return CameraView(intrinsics=matrices, pos=np.stack([view.pos for view in views]), mat=rotations)
 
 
-class Stage:
+class Viewpoints:
+    """The cameras of a scene, which threads pose in turns.
+
+    Args:
+        model: any model of the scene; nothing else may use it.
+
+    Attributes:
+        model: the model.
+        cameras: names of its cameras.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = model
+        self.cameras = _names(model, _CAMERA, model.ncam)
+        self._data = mujoco.MjData(model)
+        self._lock = threading.Lock()
+
+    def view(self, camera: str | UserCamera, pose: Pose, options: VisualOptions, slot: int) -> View:
+        """Where a camera of a slot is."""
+        with self._lock:
+            self._place(pose)
+            return self._view(camera, options, slot)
+
+    def _place(self, pose: Pose) -> None:
+        model, data = self.model, self._data
+        model.body_pos[:], model.body_quat[:], data.qpos[:] = pose.body_pos, pose.body_quat, pose.qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)  # cameras and lights may follow a body's centre of mass
+        mujoco.mj_camlight(model, data)
+
+    def _view(self, camera: str | UserCamera, options: VisualOptions, slot: int) -> View:
+        if isinstance(camera, UserCamera):
+            name, view = camera.name, View(*camera.in_slot(slot))
+        else:
+            name = ALIASES.get(camera, camera)
+            index = self.cameras.index(name)
+            mat = self._data.cam_xmat[index].reshape(3, 3).copy()
+            view = View(self._data.cam_xpos[index].copy(), mat, float(self.model.cam_fovy[index]))
+        for key in (name, *(alias for alias, real in ALIASES.items() if real == name)):
+            if key in options.cameras:
+                return view.shifted(options.cameras[key])
+        return view
+
+
+class Stage(Viewpoints):
     """The visual model of a scene, which threads pose in turns.
 
     Args:
@@ -87,17 +131,14 @@ class Stage:
 
     Attributes:
         model: the visual model.
-        cameras: names of its cameras.
         instances: the names that segmentation images index; "" (index 0) is everything else: table, floor, walls.
     """
 
     def __init__(self, scene: Scene) -> None:
-        self.model = model = scene.model
-        self.cameras = _names(model, _CAMERA, model.ncam)
+        super().__init__(scene.model)
+        model = self.model
         self.instances = ("", ROBOT, *scene.entities)
         self._instance_of_body = instances_of_bodies(model, scene)
-        self._data = mujoco.MjData(model)
-        self._lock = threading.Lock()
         self._groups, self._shine = model.geom_group.copy(), model.mat_reflectance.copy()
         # Only meshes are culled. Other shapes have few triangles, and Mesa's software driver sometimes smears a wall
         # behind the camera into the image: upstream's images have that, so these must too.
@@ -170,12 +211,6 @@ class Stage:
                     for frame, camera in zip(frames, cameras, strict=True)
                 ]
 
-    def view(self, camera: str | UserCamera, pose: Pose, options: VisualOptions, slot: int) -> View:
-        """Where a camera of a slot is."""
-        with self._lock:
-            self._place(pose)
-            return self._view(camera, options, slot)
-
     def segment(self, frame: mujoco.MjvScene, codes: np.ndarray) -> np.ndarray:
         """Instances, indices into ``instances``, int16 [H, W], of MuJoCo's segment codes [H, W] of a frame."""
         table = np.zeros(frame.ngeom + 2, np.int16)
@@ -191,26 +226,9 @@ class Stage:
         return visual.znear * self.model.stat.extent, visual.zfar * self.model.stat.extent
 
     def _place(self, pose: Pose) -> None:
-        model, data = self.model, self._data
-        model.body_pos[:], model.body_quat[:], data.qpos[:] = pose.body_pos, pose.body_quat, pose.qpos
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)  # cameras and lights may follow a body's centre of mass
-        mujoco.mj_camlight(model, data)
+        super()._place(pose)
         for site, knobs, is_on in self._burners:
-            model.site_group[site] = 0 if any(is_on(data.qpos[knob]) for knob in knobs) else _HIDDEN
-
-    def _view(self, camera: str | UserCamera, options: VisualOptions, slot: int) -> View:
-        if isinstance(camera, UserCamera):
-            name, view = camera.name, View(*camera.in_slot(slot))
-        else:
-            name = ALIASES.get(camera, camera)
-            index = self.cameras.index(name)
-            mat = self._data.cam_xmat[index].reshape(3, 3).copy()
-            view = View(self._data.cam_xpos[index].copy(), mat, float(self.model.cam_fovy[index]))
-        for key in (name, *(alias for alias, real in ALIASES.items() if real == name)):
-            if key in options.cameras:
-                return view.shifted(options.cameras[key])
-        return view
+            self.model.site_group[site] = 0 if any(is_on(self._data.qpos[knob]) for knob in knobs) else _HIDDEN
 
     def _see(self, frame: mujoco.MjvScene, view: View, aspect: float) -> View:
         """Fill a frame through the model's first camera, which is put where the view is and back."""

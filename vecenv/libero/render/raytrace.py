@@ -20,13 +20,16 @@ import numpy as np
 from jaxtyping import PyTree
 from mujoco import mjx
 
+from vecenv.libero.physics.mjx import kernels
+from vecenv.libero.physics.mjx.options import remember_compilations
 from vecenv.libero.physics.private import render_context
 from vecenv.libero.render.drawing import Pose, View
 from vecenv.libero.render.gl import Frames, Shot, Wanted
 from vecenv.libero.render.options import ALIASES, POLICY_CAMERAS, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.render.ray_kernel import make_kernel
 from vecenv.libero.render.ray_light import HEADLIGHT
-from vecenv.libero.render.scenery import Scenery, installed_scenery
+from vecenv.libero.render.scenery import Scenery
+from vecenv.libero.render.sources import InstalledVisuals, VisualSource
 from vecenv.libero.render.surfaces import drawn_colors
 from vecenv.libero.scene.bddl import Problem, SceneKey
 from vecenv.util.mapped import Sized
@@ -119,6 +122,8 @@ class RayTracer:
         self._model = model = scenery.model
         self._camera_ids = [0 if name is None else _camera(model, name) for name in cameras]
         self._is_free = np.array([name is None for name in cameras])
+        remember_compilations()
+        kernels.install()
         self._put = mjx.put_model(model, impl="warp")
         sizes = self._put._impl.block_dim.__class__(render=block_dim)
         self._put = self._put.tree_replace({"_impl.block_dim": sizes}).replace(**_lamps(model))
@@ -273,10 +278,11 @@ class RayRenderer:
 
     Args:
         config: sizes, level of detail and user cameras.
+        source: where sceneries come from; None for the installed packages.
     """
 
-    def __init__(self, config: RenderConfig) -> None:
-        self._config = config
+    def __init__(self, config: RenderConfig, source: VisualSource | None = None) -> None:
+        self._config, self._source = config, source or InstalledVisuals()
         self._user_cameras = {camera.name: camera for camera in config.cameras}
         self._looks: dict[_LookKey, _Compiled] = {}
 
@@ -321,7 +327,7 @@ class RayRenderer:
         key = (problem.scene_key(), cameras, wanted)
         if key not in self._looks:
             tracer = RayTracer(
-                installed_scenery(problem, self._config.lod, self._config.colors),
+                self._source.scenery(problem, level=self._config.lod, colors=self._config.colors),
                 height=self._config.height,
                 width=self._config.width,
                 cameras=[None if name in self._user_cameras else name for name in cameras],

@@ -94,7 +94,7 @@ def content_key(source: SceneSource, asked: geometry.Demands | None = None) -> s
         OSError: a file that the MJCF refers to cannot be read.
     """
     text = _FILE.sub(_by_content, source.xml)
-    parts = [FORMAT, mujoco.__version__, _names(source), text]
+    parts = [FORMAT, mujoco.__version__, scene_names(source), text]
     if asked is not None:
         parts.append(geometry.lean_key(asked))
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
@@ -112,8 +112,8 @@ def _file_digest(path: Path, modified: int, size: int) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _names(scene: Scene | SceneSource) -> dict[str, Any]:
-    """Everything in a scene but its model, ready for JSON."""
+def scene_names(scene: Scene | SceneSource) -> dict[str, Any]:
+    """Everything in a scene but its model, ready for JSON; ``named_scene`` reads it."""
     return {
         "problem_name": scene.problem_name,
         "entities": [asdict(entity) for entity in scene.entities.values()],
@@ -129,7 +129,7 @@ def write_scene(where: Path, key: str, scene: Scene) -> None:
     """
     buffer = np.zeros(mujoco.mj_sizeModel(scene.model), np.uint8)
     mujoco.mj_saveModel(scene.model, None, buffer)
-    names, data = _names(scene), buffer.tobytes()
+    names, data = scene_names(scene), buffer.tobytes()
     described = {"format": FORMAT, "mujoco": mujoco.__version__, "sha256": _checksum(data, names), **names}
     where.mkdir(parents=True, exist_ok=True)
     caching.write_file(where / f"{key}.mjb", data)
@@ -165,10 +165,11 @@ def read_scene(where: Path, key: str) -> Scene:
         model = mujoco.MjModel.from_binary_path(str(path))
     except (ValueError, mujoco.FatalError) as error:  # gone, or replaced, since it was checked
         raise SceneFileError(f"{path}: cannot be read: {error}") from error
-    return _scene(model, names)
+    return named_scene(model, names)
 
 
-def _scene(model: mujoco.MjModel, names: Mapping[str, Any]) -> Scene:
+def named_scene(model: mujoco.MjModel, names: Mapping[str, Any]) -> Scene:
+    """The scene of a model and what ``scene_names`` returned, also after a way through JSON."""
     entities = [Entity(**_tuples(entity)) for entity in names["entities"]]
     regions = [RegionSite(**_tuples(region)) for region in names["regions"]]
     return Scene(

@@ -34,6 +34,8 @@ from vecenv.libero.tasks.suites import TaskSpec, list_suites, list_tasks
 from vecenv.util import caching
 
 INDEX, SCENES, STARTS = "index.json", "scenes", "starts"
+# What is drawn, if the export has it; ``vecenv.libero.render.exported`` writes and reads it.
+IMAGES = "images"
 # Layout of the folder; raised when it changes.
 FORMAT = 3
 
@@ -120,7 +122,7 @@ def _writable(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder}: not a folder; name a new one, or one that an export wrote")
     if folder.is_dir() and not (folder / INDEX).is_file():
-        ours = (SCENES, STARTS)  # left by an export that was interrupted
+        ours = (SCENES, STARTS, IMAGES)  # left by an export that was interrupted
         others = [path.name for path in folder.iterdir() if path.name not in ours and not path.name.startswith(".")]
         if others:
             raise ExportError(f"{folder}: not an export, it holds {min(others)}; name a new folder")
@@ -265,6 +267,15 @@ class ExportFolder:
     def suites(self) -> tuple[str, ...]:
         """The suites it holds."""
         return tuple(self._index)
+
+    def command(self, more: str) -> str:
+        """The command that writes what the folder holds, with more options."""
+        held = {profile: None for _, tasks in self._index.values() for task in tasks for profile in task.scene_ids}
+        options = [f"--suite {suite}" for suite in self.suites] if set(self.suites) != set(list_suites()) else []
+        options += [f"--geometry {profile}" for profile in held if tuple(held) != ("exact",)]
+        if self.contacts != "published":
+            options.append(f"--contacts {self.contacts}")
+        return " ".join(["vecenv compile --out", str(self.path), *options, more])
 
     def tasks(self, suite: str) -> tuple[ExportedTask, ...]:
         """The tasks of a suite in upstream's order.
