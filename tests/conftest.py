@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import jaxtyping
+import platformdirs
 import pytest
 from hypothesis import settings
 from support import checker
@@ -32,9 +34,11 @@ REPOSITORY = Path(__file__).parent.parent
 
 @pytest.fixture(scope="session", autouse=True)
 def _cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Compiled scenes go to a folder of this run, not to the user's cache."""
+    """Compiled scenes go to a folder of this run, not to the user's cache. Warp's kernels take minutes and do not."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VECENV_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        if "WARP_CACHE_PATH" not in os.environ:
+            patch.setenv("WARP_CACHE_PATH", str(platformdirs.user_cache_path("warp")))
         yield
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -20,6 +20,7 @@ import typer
 
 from vecenv.cli import fail
 from vecenv.errors import MissingDependency, VecenvError
+from vecenv.util.logs import reported
 from vecenv_eval.cli.options import given_settings, with_settings
 from vecenv_eval.config import ConfigError, EvalConfig, option_name, read_settings, setting
 
@@ -84,7 +85,8 @@ def eval_command(
     if quiet and as_json:
         fail("give --quiet or --json, not both")
     sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
-    with _display(quiet, as_json) as display, _user_errors(display):
+    reports = nullcontext() if quiet else reported()  # of what is compiled, which takes minutes on a GPU
+    with _display(quiet, as_json) as display, reports, _user_errors(display):
         status, folder = _evaluate(display, given_settings(settings), config, out, resume)
         display.end(status, folder)
     raise typer.Exit(status)

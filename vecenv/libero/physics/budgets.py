@@ -14,6 +14,7 @@ import copy
 import hashlib
 import itertools
 import json
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -27,6 +28,7 @@ from vecenv.libero.scene.elements import CONTACT_LIMIT, PAIR_LIMIT
 from vecenv.libero.scene.scene import Scene
 from vecenv.util import caching
 
+log = logging.getLogger(__name__)
 # Factors on the measured maxima. Two boxes have up to eight published contacts, and the number changes from substep to
 # substep while fingers press: 1.3 times the rows were too few for libero_10 task 0 (5 of 10 episodes of pick_place).
 MARGINS = {"contacts": 1.5, "rows": 2.0, "pairs": 1.5, "candidates": 1.5, "share": 1.75}
@@ -156,6 +158,7 @@ def cached(scene: Scene, starts: Start) -> Budget:
     path = folder / f"{_key(scene.model, starts)}.json"
     with contextlib.suppress(OSError, ValueError, TypeError):
         return Budget(**json.loads(path.read_bytes()))
+    log.info("measuring the contact memory of a scene on native MuJoCo, %d worlds", len(starts.qpos))
     budget = measure(scene, starts)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,11 +1,12 @@
-"""The private modules of MJX and MuJoCo Warp that vecenv uses, imported in this file alone.
+"""The private modules of MJX, MuJoCo Warp and Warp that vecenv uses, imported in this file alone.
 
 Out: the names below, for the published contacts (``contacts.py`` and the Warp colliders), for the order of contacts and
-sums (``deterministic.py``) and for the ray tracer (``vecenv.libero.render``). MJX gives no promise about them: they
-were read in the version ``TESTED``. The names of MuJoCo Warp exist only where ``warp`` is installed. Asking for one
-that is missing raises an ``ImportError`` that names the installed and the tested version. What the functions look like
-is checked by their users, which know what they replace: ``contacts.py`` and ``deterministic.py`` check signatures,
-``vecenv.libero.render.ray_kernel`` the kernel's arguments.
+sums (``deterministic.py``), for the compilation of kernels (``kernels.py``) and for the ray tracer
+(``vecenv.libero.render``). Their packages give no promise about them: they were read in the versions ``TESTED`` of
+mujoco-mjx and 1.18 of Warp. The names of MuJoCo Warp exist only where ``warp`` is installed. Asking for one that is
+missing raises an ``ImportError`` that names the installed and the tested version. What the functions look like is
+checked by their users, which know what they replace: ``contacts.py`` and ``deterministic.py`` check signatures,
+``vecenv.libero.render.ray_kernel`` the kernel's arguments; ``kernels.py`` does without where it fails.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ try:
     from mujoco.mjx.third_party.mujoco_warp._src.types import ConstraintState, ContactType, mat43, vec5, vec10
     from mujoco.mjx.third_party.mujoco_warp._src.warp_util import event_scope
     from mujoco.mjx.warp import render_context
+    from warp._src.jax.ffi import FfiCallable
 except ImportError as error:
     _missing = error
 
@@ -41,6 +43,7 @@ __all__ = [
     "TESTED",
     "ConstraintState",
     "ContactType",
+    "FfiCallable",
     "Geom",
     "build_rays",
     "event_scope",

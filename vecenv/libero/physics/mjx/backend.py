@@ -7,7 +7,10 @@ one compiled call a scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -29,6 +32,8 @@ from vecenv.libero.scene import goals
 from vecenv.util.arrays import AnyArray
 from vecenv.util.devices import replicated
 
+log = logging.getLogger(__name__)
+
 
 class MjxGroup:
     """The slots of one scene on the device; NumPy copies are fetched on access."""
@@ -47,6 +52,20 @@ class MjxGroup:
         self.table: goals.GoalTable | None = None
         self._fresh: mjx.Data | None = None
         self._fetched: dict[str, np.ndarray] = {}
+        self._called: set[object] = set()
+
+    @contextmanager
+    def compiling(self, program: str, *shape: object) -> Iterator[None]:
+        """Within the context a program is called; of the first call with these shapes the log says how long it took."""
+        if (program, shape) in self._called:
+            yield
+            return
+        self._called.add((program, shape))
+        what = f"{program} of {self.num_worlds} worlds with {self.built.model.nv} degrees of freedom"
+        log.info("tracing and compiling: %s", what)
+        started = time.monotonic()
+        yield
+        log.info("ready after %.1f s: %s", time.monotonic() - started, what)
 
     def replace(self, worlds: World) -> None:
         """Replace the batch after a call."""
@@ -207,7 +226,8 @@ class MjxPhysics(Physics[MjxGroup]):
         qpos[rows], qvel[rows] = start.qpos, start.qvel
         state = (qpos, qvel, np.full(n, start.time), np.full(n, start.settled))
         arrays = jax.tree.map(group.put, (bodies, state))
-        group.replace(group.compiled.start(group.system, group.worlds, group.put_mask(mask), *arrays))
+        with group.compiling("start"):
+            group.replace(group.compiled.start(group.system, group.worlds, group.put_mask(mask), *arrays))
         self._collect_faults()
 
     def write_state(self, group: MjxGroup, qpos: np.ndarray, qvel: np.ndarray, time: np.ndarray) -> None:
@@ -236,7 +256,8 @@ class MjxPhysics(Physics[MjxGroup]):
 
         def call(group: MjxGroup) -> tuple[Loop, None]:
             rows = group.put(chunk[group.slots]), group.put_mask(active[group.slots]), group.put(limit[group.slots])
-            return group.compiled.run(until_success)(group.system, _table(group), group.worlds, *rows), None
+            with group.compiling("step", chunk.shape[1], until_success):
+                return group.compiled.run(until_success)(group.system, _table(group), group.worlds, *rows), None
 
         ran, _ = self._each(active, call)
         for k in range(chunk.shape[1]):
@@ -268,7 +289,8 @@ class MjxPhysics(Physics[MjxGroup]):
             group_plan = jax.tree.map(lambda x: group.put(np.asarray(x)[group.slots]), plan)
             rows = group_plan, group.put_mask(active[group.slots]), group.put(limit[group.slots])
             follow = group.compiled.follow(config, traced, until_success)
-            loop, *rest = follow(group.system, misses, _table(group), group.worlds, *rows)
+            with group.compiling("waypoints", config, traced, until_success, plan.valid.shape[1]):
+                loop, *rest = follow(group.system, misses, _table(group), group.worlds, *rows)
             return loop, rest
 
         ran, results = self._each(active, call)

@@ -19,6 +19,7 @@ from mujoco import mjx
 from vecenv.controllers import kinematics, osc
 from vecenv.libero.physics import budgets
 from vecenv.libero.physics.mjx import contacts as mjx_contacts
+from vecenv.libero.physics.mjx import kernels
 from vecenv.libero.physics.mjx.options import Impl, MjxError, remember_compilations, resolve_impl
 from vecenv.libero.robot import HOME_QPOS, panda_chain
 from vecenv.libero.scene import contacts
@@ -110,6 +111,8 @@ def build(
     if deterministic and chosen != "warp":
         raise MjxError("deterministic=True is for MuJoCo Warp and native MuJoCo; here MJX runs in pure JAX")
     remember_compilations()
+    if chosen == "warp":
+        kernels.install()
     if [*scene.arm_qpos, *scene.finger_qpos] != list(range(ROBOT_JOINTS)):
         raise MjxError("the arm and its fingers must be the scene's first joints")
     if scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:

@@ -81,7 +81,12 @@ def jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
 
 
 def remember_compilations() -> None:
-    """Turn JAX's persistent compilation cache on, in the user's cache folder, unless a folder was already chosen."""
+    """Turn JAX's persistent compilation cache on, in the user's cache folder, unless a folder was already chosen.
+
+    XLA's own caches of autotuning stay off: with them the keys of programs hold the folder's path (jax 0.10.2), and a
+    folder that was copied elsewhere, or mounted there, would be of no use.
+    """
     folder = caching.folder("jax")
     if jax.config.values.get("jax_compilation_cache_dir") is None and folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
