@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from typing import Any
 
@@ -35,8 +35,9 @@ BUDGET = Budget(contacts=218, rows=935, pairs=833, candidates=215)
 OPTIONS: dict[str, Any] = {**compiler_options(), "xla_backend_optimization_level": 0}
 compiled: Callable[..., Callable[..., Any]] = partial(jax.jit, compiler_options=OPTIONS)
 
-NOTHING = dict.fromkeys(FACTORS, (1.0, 1.0))
-PHYSICS = Randomization(**{name: (0.5 + 0.05 * k, 1.5 + 0.1 * k) for k, name in enumerate(FACTORS)})
+NOTHING: dict[str, Any] = dict.fromkeys(FACTORS, (1.0, 1.0))
+BOUNDS: dict[str, Any] = {name: (0.5 + 0.05 * k, 1.5 + 0.1 * k) for k, name in enumerate(FACTORS)}
+PHYSICS = Randomization(**BOUNDS)
 LOOK = Randomization(light=0.4, light_shift=0.5, color=0.3, camera_pos=0.02, camera_turn=0.1)
 INSTANCES, CAMERAS = 5, ("agentview", "wrist")
 
@@ -179,7 +180,15 @@ def test_states_keep_their_structure() -> None:
     assert jax.tree.map(lambda x: (x.shape, x.dtype), first) == jax.tree.map(lambda x: (x.shape, x.dtype), then)
 
 
+@pytest.fixture
+def rank_promotion() -> Iterator[None]:
+    with jax.numpy_rank_promotion("allow"):
+        yield
+
+
+# The ray tracer promotes ranks.
 @pytest.mark.heavy
+@pytest.mark.usefixtures("rank_promotion")
 def test_images_differ_as_each_quantity_says() -> None:
     env = made(obs="pixels", image_size=16, randomization=dataclasses.replace(LOOK, **NOTHING))
     begun = compiled(jax.vmap(env.reset))(keys(2))

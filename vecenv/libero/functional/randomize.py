@@ -108,26 +108,33 @@ class Randomizer:
             spread = getattr(self._config, name)
             return jax.random.uniform(keys[name], shape, jnp.float32, -spread, spread)
 
-        coloured = np.arange(self._instances)[:, None] > 0
+        coloured, moving = np.arange(self._instances)[:, None] > 0, jnp.asarray(self._moving)
         return Look(
             light=1 + within("light", ()),
             light_shift=within("light_shift", (3,)),
             color=1 + jnp.where(coloured, within("color", (self._instances, 3)), 0.0),
-            camera_pos=self._moving * within("camera_pos", (len(self._moving), 3)),
-            camera_turn=self._moving * within("camera_turn", (len(self._moving), 3)),
+            camera_pos=moving * within("camera_pos", (len(moving), 3)),
+            camera_turn=moving * within("camera_turn", (len(moving), 3)),
         )
 
 
 def _physics(model: mjx.Model, rng: PRNGKeyArray, config: Randomization) -> Variation:
     """The factors of one world."""
-    keys = dict(zip(FACTORS, jax.random.split(rng, len(FACTORS)), strict=True))
-    shapes = {"mass": (model.nbody,), **dict.fromkeys(("damping", "armature", "frictionloss"), (model.nv,))}
+    keys: dict[str, jax.Array] = dict(zip(FACTORS, jax.random.split(rng, len(FACTORS)), strict=True))
+    bodies, dofs = (model.nbody,), (model.nv,)
 
-    def factor(name: str) -> Float[Array, "..."]:
+    def factor(name: str, shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         low, high = getattr(config, name)
-        return jax.random.uniform(keys[name], shapes.get(name, ()), minval=low, maxval=high)
+        return jax.random.uniform(keys[name], shape, minval=low, maxval=high)
 
-    return Variation(**{name: factor(name) for name in FACTORS})
+    return Variation(
+        friction=factor("friction"),
+        mass=factor("mass", bodies),
+        damping=factor("damping", dofs),
+        armature=factor("armature", dofs),
+        frictionloss=factor("frictionloss", dofs),
+        gripper=factor("gripper"),
+    )
 
 
 def randomize(

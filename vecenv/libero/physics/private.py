@@ -15,6 +15,7 @@ import importlib.metadata
 from typing import NoReturn
 
 from mujoco.mjx._src import collision_driver as jax_collision_driver
+from mujoco.mjx._src import scan as jax_scan
 
 _missing: ImportError | None = None
 try:
@@ -49,6 +50,7 @@ __all__ = [
     "event_scope",
     "installed_version",
     "jax_collision_driver",
+    "jax_scan",
     "mat43",
     "mat83f",
     "pack_rgba_to_uint32",

@@ -24,6 +24,7 @@ from vecenv.controllers import kinematics, osc, waypoint
 from vecenv.libero.physics import newton
 from vecenv.libero.physics.base import OBSERVED_FINGERS, OBSERVED_POSE, SUBSTEPS
 from vecenv.libero.physics.mjx.blocks import for_worlds
+from vecenv.libero.physics.mjx.fusion import level_by_level
 from vecenv.libero.physics.mjx.model import ROBOT_JOINTS, System
 from vecenv.libero.physics.mjx.options import is_deterministic
 from vecenv.libero.scene import goals
@@ -160,7 +161,8 @@ def forward(system: System, world: World) -> mjx.Data:
     with jax.default_matmul_precision("highest"):
         if world.data.impl == mjx.Impl.WARP:
             return mjx.forward(model, world.data)
-        return sensed(system, mjx.collision(model, mjx.kinematics(model, world.data)))
+        with level_by_level():
+            return sensed(system, mjx.collision(model, mjx.kinematics(model, world.data)))
 
 
 def _placed(system: System, world: World) -> mjx.Data:
@@ -280,13 +282,15 @@ def substep(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     ``vecenv.libero.physics.newton``."""
     if data.impl == mjx.Impl.WARP:
         return mjx.step(model, data)
-    for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration, newton.solve):
-        data = stage(model, data)
+    with level_by_level():
+        for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration, newton.solve):
+            data = stage(model, data)
     # In jaxlib 0.10, threads of XLA's pool wait for parts of a batched Cholesky factorisation that the same pool has
     # yet to compute. On two threads, the solver's factorisation and the integrator's, which is independent of it,
     # deadlock when they run at the same time. Adding 0 x acceleration makes the integrator wait for the solver; XLA
     # does not fold it away, because the acceleration may be non-finite.
-    return mjx.euler(model, data.tree_replace({"_impl.M": data._impl.M + 0 * data.qacc[:1]}))
+    with level_by_level():
+        return mjx.euler(model, data.tree_replace({"_impl.M": data._impl.M + 0 * data.qacc[:1]}))
 
 
 STATE = (
