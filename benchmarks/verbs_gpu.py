@@ -55,6 +55,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--batch", nargs="+", type=int, default=[1024])
     parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
     parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--antialias", action="store_true", help="four rays a pixel at edges")
     parser.add_argument("--backend", default="warp")
     parser.add_argument("--devices", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=3)
@@ -96,7 +97,9 @@ class Side:
             num_devices=options.devices,
             scenes=options.scenes,
             arrays="jax" if mode == "jax" else "numpy",
-            render=RenderConfig(engine="raytrace", lod="fast", height=options.size, width=options.size),
+            render=RenderConfig(
+                engine="raytrace", lod="fast", height=options.size, width=options.size, antialias=options.antialias
+            ),
             max_steps=10**6,
             success="final",
         )

@@ -55,7 +55,9 @@ def small(**reflectance: float) -> Scenery:
 
 def small_seen(found: Scenery, **options: Any) -> Any:
     """The small scene through its cameras."""
-    return small_look(RayTracer(found, **{"height": 128, "width": 128, "cameras": ("front", "low"), **options}))
+    return small_look(
+        RayTracer(found, **{"height": 128, "width": 128, "cameras": ("front", "low"), "antialias": True, **options})
+    )
 
 
 def small_look(rays: RayTracer, style: Style | None = None) -> Any:

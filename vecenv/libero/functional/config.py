@@ -118,6 +118,8 @@ class FunctionalConfig:
             ``FunctionalLibero.layout``; and ``"pixels"``, ray-traced camera images, which need ``warp`` and make
             observations dictionaries.
         image_size: height and width of the images, pixels.
+        antialias: whether edges in images are traced again with four rays a pixel, see
+            ``vecenv.libero.render.options.RenderConfig``.
         scenery: what there is to see, a file that ``vecenv.libero.render.scenery.Scenery.save`` wrote; None takes it
             from ``scenes``, which needs ``vecenv compile --images raytrace``, or compiles it from the installed
             packages.
@@ -150,6 +152,7 @@ class FunctionalConfig:
     action_scale: float = 1.0
     obs: str | Sequence[str] = ("proprio", "objects")
     image_size: int = 64
+    antialias: bool = False
     scenery: str | None = None
     colors: str = "published"
     reward: str = "sparse"

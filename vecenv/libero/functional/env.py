@@ -268,4 +268,4 @@ def _tracer(scene: Scene, problem: Problem, config: FunctionalConfig) -> RayTrac
     else:
         scenery = Scenery.load(file)
     scenery.check(scene.model, colors)
-    return RayTracer(scenery, height=size, width=size)
+    return RayTracer(scenery, height=size, width=size, antialias=config.antialias)

@@ -121,6 +121,7 @@ class RayRenderer:
                 rgb=wanted.rgb,
                 depth=wanted.depth,
                 segmentation=wanted.segmentation,
+                antialias=self._config.antialias,
                 devices=None if mesh is None else _warp_names(mesh),
             )
             draw = jit(functools.partial(_draw, tracer, BodyPoses(model)))

@@ -91,7 +91,8 @@ class RayTracer:
         rgb, depth, segmentation: which images ``look`` makes.
         samples: rays per pixel along each side, averaged, for every pixel. 2 takes four times as long as 1.
         antialias: whether pixels that differ from their neighbours are traced again, through the four points where GL
-            takes its samples; with one sample per pixel only. Depths and segmentations stay those of the middle.
+            takes its samples; with one sample per pixel only. Depths and segmentations stay those of the middle. Images
+            take about twice as long.
         block_dim: threads of a block on the GPU.
         tile: most rows and columns of pixels that neighbouring threads trace; ``(1, 1)`` for row by row.
         registers: most registers of a thread on the GPU; 0 leaves it to the compiler.
@@ -113,7 +114,7 @@ class RayTracer:
         depth: bool = False,
         segmentation: bool = False,
         samples: int = 1,
-        antialias: bool = True,
+        antialias: bool = False,
         block_dim: int = BLOCK,
         tile: tuple[int, int] = TILE,
         registers: int = REGISTERS,

@@ -161,10 +161,16 @@ def _note() -> Iterator[list[Kernels]]:
             if branch is not None:
                 branch(**kwargs)
 
+    def suggested(original: Callable[..., Any], kernel: Any, device: Any = None) -> tuple[int, int]:
+        place = wp.get_device(device)
+        kernel.module.load(place)  # asking loads the kernel, with threads of its own
+        return (256, 1) if place.is_cuda else original(kernel, device)
+
     def nothing(original: Callable[..., Any], *args: Any, **kwargs: Any) -> None:
         """Sorts and sums of what no kernel has written."""
 
     replaced = [(wp.Module, "load", load), (wp, "capture_while", once), (wp, "capture_if", both)]
+    replaced += [(wp, "get_suggested_block_size", suggested)]
     replaced += [(wp.utils, name, nothing) for name in ("segmented_sort_pairs", "radix_sort_pairs", "array_scan")]
     with _lock, contextlib.ExitStack() as stack:
         for owner, name, replacement in replaced:
