@@ -22,6 +22,7 @@ from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.placement import Placement, PlacementError
 
 _Kind = TypeVar("_Kind", bound=Control)
+_Result = TypeVar("_Result")
 # Tasks that ``repr`` names before it only counts them.
 _LISTED = 8
 
@@ -202,7 +203,7 @@ class SlotBatch(ABC):
                 self._arm(stale)
             self._begin(stale)
         tasks, episodes = self._placement.task, self._placement.episode
-        return ResetInfo(
+        info = ResetInfo(
             instruction=self.instructions(),
             episode_id=tuple(
                 f"{self.suite}/{self._label(int(task))}/{episode}"
@@ -212,6 +213,7 @@ class SlotBatch(ABC):
             task_id=tasks.copy(),
             max_steps=self._max_steps.copy(),
         )
+        return self._delivered(info)
 
     def _begin(self, stale: np.ndarray) -> None:
         for array in (self._terminated, self._truncated, self._success, self._solved, self._steps, self._reward):
@@ -381,7 +383,7 @@ class SlotBatch(ABC):
             "ticks": self._steps - before,
             **self._diagnostics(),
         }
-        return kind(
+        control = kind(
             reward=reward,
             terminated=self._terminated.copy(),
             truncated=self._truncated.copy(),
@@ -390,13 +392,18 @@ class SlotBatch(ABC):
             info=info,
             **extra,
         )
+        return self._delivered(control)
+
+    def _delivered(self, result: _Result) -> _Result:
+        """What a method returns, in the arrays that the caller wants; NumPy's unless a subclass offers others."""
+        return result
 
     # -- verdicts ------------------------------------------------------------------------------------------------------
 
     def evaluate(self) -> Metrics:
         """The verdict of each slot as of its last executed tick."""
         self._check_open()
-        return Metrics(
+        metrics = Metrics(
             success=self._success.copy(),
             num_steps=self._steps.copy(),
             suite=self.suite,
@@ -405,6 +412,7 @@ class SlotBatch(ABC):
             success_first=self._solved.copy(),
             success_final=self._success.copy(),
         )
+        return self._delivered(metrics)
 
     @property
     def done(self) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv import protocols
-from vecenv.contract import Control, Metrics, ResetInfo, State
+from vecenv.contract import Control, State
 from vecenv.controllers import waypoint
 from vecenv.libero import observe, starts
 from vecenv.libero.config import LiberoConfig, LiberoError
@@ -40,7 +40,6 @@ from vecenv.slots import SlotBatch
 from vecenv.util.transfers import put
 
 _Result = TypeVar("_Result")
-_Kind = TypeVar("_Kind", bound=Control)
 # Arrays of ``State`` that ``set_state`` takes.
 _STATE = ("qpos", "qvel", "time")
 
@@ -196,30 +195,7 @@ class LiberoEnv(SlotBatch):
         self._physics = None
 
     def _delivered(self, result: _Result) -> _Result:
-        """What a verb returns, in the arrays that the configuration asks for."""
         return put(result) if self._on_device else result
-
-    def reset(self) -> ResetInfo:
-        """Make every slot live: finished slots start their episode again, live ones are not changed.
-
-        Returns:
-            Episode metadata of every slot; no observation.
-        """
-        return self._delivered(super().reset())
-
-    def evaluate(self) -> Metrics:
-        """The verdict of each slot as of its last executed tick."""
-        return self._delivered(super().evaluate())
-
-    def _control(
-        self,
-        kind: type[_Kind],
-        reward: np.ndarray,
-        before: np.ndarray,
-        sanitized: np.ndarray | None = None,
-        **extra: np.ndarray | tuple[str, ...],
-    ) -> _Kind:
-        return self._delivered(super()._control(kind, reward, before, sanitized, **extra))
 
     # -- stepping ------------------------------------------------------------------------------------------------------
 

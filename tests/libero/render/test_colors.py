@@ -23,7 +23,6 @@ from vecenv.libero.render import cameras, colors
 from vecenv.libero.render.gl import choose, open_context
 from vecenv.libero.render.options import RenderConfig, RenderError, VisualOptions
 from vecenv.libero.render.scenery import Scenery, installed_scenery
-from vecenv.libero.tasks.export import export
 from vecenv.libero.tasks.sources import installed_tasks
 from vecenv.libero.tasks.suites import list_tasks
 
@@ -110,16 +109,6 @@ def test_a_texture_that_walls_are_given_is_seen_on_them() -> None:
     assert (seen[0] != seen[1]).any()
     np.testing.assert_array_equal(*swapped)
     assert np.abs(swapped[0].astype(int) - seen[0]).max() > 20
-
-
-@needs_gl
-def test_exported_folders_show_the_same(tmp_path: Path) -> None:
-    """A folder holds physics; whichever the tasks come from, images have the colours that are asked for."""
-    export(tmp_path, ["libero_object"])
-    for asked in ("published", "current"):
-        render = RenderConfig(height=SIZE, width=SIZE, colors=asked)
-        found = reference(DECODED).drawn(render, scenes=str(tmp_path))
-        np.testing.assert_array_equal(found, drawn(DECODED, colors=asked))
 
 
 def test_colours_that_there_are_none_of_are_refused(tmp_path: Path) -> None:

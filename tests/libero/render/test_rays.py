@@ -10,7 +10,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from support.images import needs_gl
+from support.images import needs_gl, psnr
 
 import vecenv
 from vecenv.libero.config import LiberoError
@@ -97,7 +97,8 @@ def test_only_the_slots_that_are_asked_for_are_drawn() -> None:
     for images in (every, some):
         images.prepare("agentview", "wrist")
     for name in ("agentview", "wrist"):
-        np.testing.assert_array_equal(some[name][[1, 2, 4]], every[name][[1, 2, 4]])
+        # Another number of worlds is another program, whose sums may differ in their last bit.
+        assert psnr(some[name][[1, 2, 4]], every[name][[1, 2, 4]]) > 50
         assert not some[name][[0, 3, 5]].any()
     assert not env.observe_egocentric(slots=[]).images["agentview"].any()
     env.close()
