@@ -95,6 +95,7 @@ def arrays_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     return {name: value for name, value in named if isinstance(value, np.ndarray)}
 
 
+@pytest.mark.heavy
 def test_without_the_packages_images_are_bit_identical(folder: Path, tmp_path: Path) -> None:
     variables = ("VECENV_LIBERO_ROOT", "VECENV_LIBERO_ASSETS", "VECENV_ROBOSUITE_ASSETS")
     environment = {**os.environ, **dict.fromkeys(variables, str(tmp_path))}

@@ -61,13 +61,12 @@ def test_mocap_bodies_are_refused() -> None:
 def test_images_on_the_device_are_those_in_numpy_and_do_not_change() -> None:
     env = batch()
     seen = env.observe_egocentric()
-    for images in (seen.images_device, seen.depths_device, seen.segmentations_device):
+    for images in (seen.images_device, seen.segmentations_device):
         images.prepare("agentview", "wrist")
     before = {name: np.array(seen.images_device[name]) for name in ("agentview", "wrist")}
     for name, image in before.items():
         assert isinstance(seen.images_device[name], jax.Array)
         np.testing.assert_array_equal(seen.images[name], image)
-        np.testing.assert_array_equal(seen.depths_device[name], seen.depths[name])
         np.testing.assert_array_equal(seen.segmentations_device[name], seen.segmentations[name])
     late = env.observe_egocentric()  # not read yet
     seen.images["agentview"][:] = 0  # NumPy arrays are the caller's
