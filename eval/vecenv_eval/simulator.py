@@ -65,13 +65,13 @@ def describe_suite(name: str, protocol: str = protocols.DEFAULT) -> Suite:
     Raises:
         ConfigError: there is no suite or protocol of that name, or they do not go together.
     """
-    family = _family(name)
+    is_simpler = _family(name) == protocols.SIMPLER
     try:
+        if not is_simpler:
+            return _libero(name, protocol, installed_tasks(name))
         per_task = vecenv.eval_metadata(name, protocol)["episodes_per_task"]
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    if family != protocols.SIMPLER:
-        return _libero(name, installed_tasks(name), per_task)
     tasks = vecenv.list_tasks(name)
     return Suite(
         name=name,
@@ -94,8 +94,7 @@ def describe_exported(name: str, protocol: str, folder: str) -> Suite:
     if _family(name) == protocols.SIMPLER:
         raise ConfigError(f"scenes={folder}: {name} is of SIMPLER, whose scenes are not exported")
     try:
-        per_task = protocols.protocol(protocol, protocols.LIBERO).episodes or NUM_EPISODES
-        return _libero(name, exported_tasks(folder, name), per_task)
+        return _libero(name, protocol, exported_tasks(folder, name))
     except (VecenvError, ValueError) as error:
         raise ConfigError(str(error)) from error
 
@@ -107,7 +106,11 @@ def _family(name: str) -> str:
     return vecenv.family(name)
 
 
-def _libero(name: str, tasks: Sequence[Task], per_task: int) -> Suite:
+def _libero(name: str, protocol: str, tasks: Sequence[Task]) -> Suite:
+    """A suite of these tasks; errors of a protocol that does not exist or says nothing about it."""
+    chosen = protocols.protocol(protocol, protocols.LIBERO)
+    chosen.horizon_of(name)
+    per_task = chosen.episodes or NUM_EPISODES
     return Suite(
         name=name,
         instructions=tuple(task.instruction for task in tasks),
