@@ -2,15 +2,20 @@
 
     python examples/ppo.py --objective reach --num-envs 2048 --steps 3_000_000 --out runs/reach
     python examples/ppo.py --objective reach --steps 6_000_000 --out runs/reach --resume
+    python examples/ppo.py --objective goal --task all --hold-back 25 --out runs/goal
+    python examples/ppo.py --objective lift --obs pixels --out runs/pixels
 
 In: a task, an objective of ``vecenv.libero.functional.objectives`` and the options below. Out, in the folder ``--out``:
 ``curve.csv`` (one row an iteration), ``curve.png`` where matplotlib is installed, ``checkpoint.npz`` (all there is:
-networks, optimiser, worlds and random key, so a resumed run goes on as if it had not stopped), ``config.json`` and
-``result.json`` with the success rate of the policy without noise.
+networks, optimiser, worlds and random key, so a resumed run goes on as if it had not stopped), ``policy.npz`` (only
+what acts), ``config.json`` and ``result.json`` with the success rate of the policy without noise. With ``--task all``
+each task has a folder of its own in it. ``examples/ppo_policy.py`` is what was learnt as a policy of ``vecenv eval``.
 
 An iteration is one compiled call: a rollout of all worlds, generalised advantage estimation, and a few epochs of
 clipped updates. Any environment serves that has ``reset(key)``, ``step(state, action)``, ``action_size`` and
-``observation_size``, whose states have ``obs``, ``reward``, ``done`` and ``metrics["success"]``.
+``observation_size``, whose states have ``obs``, ``reward``, ``done`` and ``metrics["success"]``. Observations are
+vectors, or dictionaries of a vector ``state`` and images ``pixels/...``, as Brax has them; images go through
+convolutions that policy and value function share.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ import dataclasses
 import functools
 import json
 import math
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +41,9 @@ from jax import lax
 from vecenv.libero import functional
 from vecenv.libero.functional.objectives import OBJECTIVES
 from vecenv.libero.scene.lean.geometry import PROFILES
+from vecenv.libero.tasks.export import exported_tasks
+from vecenv.libero.tasks.sources import installed_tasks
+from vecenv.libero.tasks.suites import NUM_EPISODES
 
 try:
     import optax
@@ -116,8 +125,8 @@ class Environment(Protocol):
         ...
 
     @property
-    def observation_size(self) -> int:
-        """Width of an observation."""
+    def observation_size(self) -> Any:
+        """Width of an observation, or a dictionary of the shapes of its parts."""
         ...
 
     def reset(self, rng: jax.Array) -> Any:
@@ -133,29 +142,43 @@ class Environment(Protocol):
 # Policy and value function.
 
 Layers = list[dict[str, jax.Array]]
+# Convolutions over images: (output channels, side of the kernel, stride), then a layer of so many numbers.
+CONVOLUTIONS, SEEN = ((32, 8, 4), (64, 4, 2), (64, 3, 1)), 256
+
+
+class Obs(NamedTuple):
+    """Observations: vectors [..., n] and images uint8 [..., H, W, channels], None where there are none."""
+
+    vector: jax.Array
+    images: jax.Array | None
 
 
 class Networks(NamedTuple):
-    """What is learnt: layers of the policy's mean, log of its standard deviation [A], layers of the value function."""
+    """What is learnt: layers of the policy's mean, log of its standard deviation [A], layers of the value function.
+
+    ``vision`` are the layers that both see images through; empty without images.
+    """
 
     policy: Layers
     log_std: jax.Array
     value: Layers
+    vision: Layers
 
 
 class Normalizer(NamedTuple):
-    """Running mean [n] and variance [n] of ``count`` observations."""
+    """Running mean [n] and variance [n] of ``count`` vectors."""
 
     count: jax.Array
     mean: jax.Array
     var: jax.Array
 
-    def __call__(self, obs: jax.Array) -> jax.Array:
-        """Observations of about mean 0 and deviation 1; what hardly ever varies is not blown up."""
-        return jnp.clip((obs - self.mean) / jnp.maximum(jnp.sqrt(self.var), 0.01), -10, 10)
+    def __call__(self, obs: Obs) -> Obs:
+        """Vectors of about mean 0 and deviation 1; what hardly ever varies is not blown up. Images stay."""
+        scaled = (obs.vector - self.mean) / jnp.maximum(jnp.sqrt(self.var), 0.01)
+        return obs._replace(vector=jnp.clip(scaled, -10, 10))
 
     def updated(self, obs: jax.Array) -> Normalizer:
-        """With more observations, [..., n] (Chan et al., parallel variance)."""
+        """With more vectors, [..., n] (Chan et al., parallel variance)."""
         axes = tuple(range(obs.ndim - 1))
         more = obs.size // obs.shape[-1]
         count, shift = self.count + more, obs.mean(axes) - self.mean
@@ -176,12 +199,71 @@ def init_layers(rng: jax.Array, widths: Sequence[int], last_scale: float) -> Lay
 
 def init_networks(rng: jax.Array, env: Environment, config: PPOConfig) -> Networks:
     """Networks that know nothing yet."""
-    policy, value = jax.random.split(rng)
-    widths = (env.observation_size, *config.hidden)
+    policy, value, vision = jax.random.split(rng, 3)
+    width, image = observed(env)
+    layers = [] if image is None else init_vision(vision, image)
+    widths = (width + (SEEN if layers else 0), *config.hidden)
     log_std = jnp.full(env.action_size, math.log(config.initial_std))
     return Networks(
-        init_layers(policy, (*widths, env.action_size), 0.01), log_std, init_layers(value, (*widths, 1), 0.01)
+        policy=init_layers(policy, (*widths, env.action_size), 0.01),
+        log_std=log_std,
+        value=init_layers(value, (*widths, 1), 0.01),
+        vision=layers,
     )
+
+
+def observed(env: Environment) -> tuple[int, tuple[int, int, int] | None]:
+    """Width of the vector of an observation, and the shape of its images, laid upon each other channel by channel."""
+    size = env.observation_size
+    if not isinstance(size, Mapping):
+        return int(size), None
+    shapes = [shape for name, shape in sorted(size.items()) if name != "state"]
+    if not shapes or len(set(shapes)) > 1:
+        raise RunError(f"observations have images of shapes {shapes}: expected one shape")
+    height, width, channels = shapes[0]
+    return math.prod(size.get("state", (0,))), (height, width, channels * len(shapes))
+
+
+def packed(obs: Any) -> Obs:
+    """Observations of an environment; images as bytes, which need a quarter of the memory."""
+    if not isinstance(obs, Mapping):
+        return Obs(obs, None)
+    views = [view for name, view in sorted(obs.items()) if name != "state"]
+    images = jnp.round(jnp.concatenate(views, axis=-1) * 255).astype(jnp.uint8)
+    return Obs(obs["state"] if "state" in obs else jnp.zeros((*images.shape[:-3], 0)), images)
+
+
+def init_vision(rng: jax.Array, shape: tuple[int, int, int]) -> Layers:
+    """Convolutions for images of this shape, and the layer after them."""
+    height, width, channels = shape
+    layers = []
+    for key, (made, side, stride) in zip(jax.random.split(rng, len(CONVOLUTIONS)), CONVOLUTIONS, strict=True):
+        height, width = (height - side) // stride + 1, (width - side) // stride + 1
+        if min(height, width) < 1:
+            raise RunError(f"images of {shape[0]} x {shape[1]} pixels are too small for the convolutions")
+        weight = jax.random.normal(key, (side, side, channels, made)) / math.sqrt(side * side * channels)
+        layers.append({"weight": weight, "bias": jnp.zeros(made)})
+        channels = made
+    return layers + init_layers(jax.random.fold_in(rng, 1), (height * width * channels, SEEN), 1.0)
+
+
+def see(layers: Layers, images: jax.Array) -> jax.Array:
+    """What is seen in images: numbers [..., SEEN]."""
+    x = images.reshape(-1, *images.shape[-3:]).astype(jnp.float32) / 255 - 0.5
+    for layer, (_, _, stride) in zip(layers[:-1], CONVOLUTIONS, strict=True):
+        x = lax.conv_general_dilated(
+            x, layer["weight"], (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+        x = jax.nn.silu(x + layer["bias"])
+    x = jax.nn.silu(apply_layers(layers[-1:], x.reshape(len(x), -1)))
+    return x.reshape(*images.shape[:-3], -1)
+
+
+def features(networks: Networks, obs: Obs) -> jax.Array:
+    """What policy and value function are computed of, [..., n]."""
+    if obs.images is None:
+        return obs.vector
+    return jnp.concatenate([obs.vector, see(networks.vision, obs.images)], axis=-1)
 
 
 def apply_layers(layers: Layers, x: jax.Array) -> jax.Array:
@@ -191,14 +273,16 @@ def apply_layers(layers: Layers, x: jax.Array) -> jax.Array:
     return x @ layers[-1]["weight"] + layers[-1]["bias"]
 
 
-def policy_of(networks: Networks, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+def policy_of(networks: Networks, obs: Obs) -> tuple[jax.Array, jax.Array]:
     """Mean [..., A] in (-1, 1) and standard deviation [A] of the action for normalised observations."""
-    return jnp.tanh(apply_layers(networks.policy, obs)), jnp.exp(jnp.clip(networks.log_std, -3, 0.5))
+    return jnp.tanh(apply_layers(networks.policy, features(networks, obs))), jnp.exp(
+        jnp.clip(networks.log_std, -3, 0.5)
+    )
 
 
-def value_of(networks: Networks, obs: jax.Array) -> jax.Array:
+def value_of(networks: Networks, obs: Obs) -> jax.Array:
     """Expected discounted reward from normalised observations on, [...]."""
-    return apply_layers(networks.value, obs)[..., 0]
+    return apply_layers(networks.value, features(networks, obs))[..., 0]
 
 
 def log_probability(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array:
@@ -230,11 +314,11 @@ class Worlds(NamedTuple):
 class Transition(NamedTuple):
     """An action and what came of it; leaves [T, B, ...]. ``next_obs`` is from before a reset."""
 
-    obs: jax.Array
+    obs: Obs
     action: jax.Array
     log_prob: jax.Array
     reward: jax.Array
-    next_obs: jax.Array
+    next_obs: Obs
     terminated: jax.Array
     ended: jax.Array
 
@@ -297,7 +381,7 @@ def rollout(
 
     def tick(worlds: Worlds, rng: jax.Array) -> tuple[Worlds, tuple[Transition, Statistics]]:
         act, reset = jax.random.split(rng)
-        obs = worlds.state.obs
+        obs = packed(worlds.state.obs)
         mean, std = policy_of(networks, normalizer(obs))
         action = mean + noise * std * jax.random.normal(act, mean.shape)
         after, reward = advance(env, worlds.state, action, config.action_repeat)
@@ -305,7 +389,7 @@ def rollout(
         age, total = worlds.age + config.action_repeat, worlds.total + reward
         ended = terminated | (age >= config.episode_length)
         logged = log_probability(mean, std, action)
-        transition = Transition(obs, action, logged, reward, after.obs, terminated, ended)
+        transition = Transition(obs, action, logged, reward, packed(after.obs), terminated, ended)
         seen = ended & worlds.counts
         fault = after.metrics.get("fault", jnp.zeros_like(after.done))
         sums = [jnp.sum(jnp.where(seen, x, 0)) for x in (1.0, total, after.metrics["success"], age, fault)]
@@ -348,8 +432,9 @@ def init_learner(env: Environment, config: PPOConfig) -> Learner:
     rng, layers, start = jax.random.split(jax.random.key(config.seed), 3)
     networks = init_networks(layers, env, config)
     worlds = begin(env, start, config, staggered=True)
-    none = jnp.zeros(env.observation_size)
-    normalizer = Normalizer(jnp.zeros(()), none, none).updated(worlds.state.obs)
+    first = packed(worlds.state.obs).vector
+    none = jnp.zeros(first.shape[-1])
+    normalizer = Normalizer(jnp.zeros(()), none, none).updated(first)
     learner = Learner(networks, make_optimizer(config).init(networks), normalizer, worlds, jax.random.key_data(rng))
     # No weak types: they would end with the first iteration, and it would be compiled twice.
     return jax.tree.map(lambda x: x.astype(x.dtype), learner)
@@ -360,8 +445,10 @@ def advantages(networks: Networks, obs: Normalizer, data: Transition, config: PP
 
     What follows an episode that was cut off is worth what the value function says; after success or failure nothing is.
     """
-    value = value_of(networks, obs(data.obs))
-    following = jnp.where(data.terminated, 0.0, value_of(networks, obs(data.next_obs)))
+    # Action by action: the convolutions of all images at once would need much memory.
+    values = functools.partial(lax.map, functools.partial(value_of, networks))
+    value = values(obs(data.obs))
+    following = jnp.where(data.terminated, 0.0, values(obs(data.next_obs)))
     delta = data.reward + config.discount * following - value
 
     def backwards(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -376,7 +463,7 @@ def advantages(networks: Networks, obs: Normalizer, data: Transition, config: PP
 class Batch(NamedTuple):
     """What the loss is computed of; leaves [N, ...], observations normalised."""
 
-    obs: jax.Array
+    obs: Obs
     action: jax.Array
     log_prob: jax.Array
     advantage: jax.Array
@@ -428,7 +515,7 @@ def iteration(
     batch = Batch(obs(data.obs), data.action, data.log_prob, advantage, target)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
     networks, state, watched = learn(networks, learner.optimizer, flat, order, config)
-    learner = Learner(networks, state, obs.updated(data.obs), worlds, jax.random.key_data(rng))
+    learner = Learner(networks, state, obs.updated(data.obs.vector), worlds, jax.random.key_data(rng))
     return learner, statistics, watched
 
 
@@ -436,7 +523,7 @@ def iteration(
 # Checkpoints and curves.
 
 
-SETTINGS = "config.json"
+SETTINGS, POLICY = "config.json", "policy.npz"
 
 
 def save(path: Path, tree: Any, **numbers: float) -> None:
@@ -459,12 +546,32 @@ def load(path: Path, like: Any, *numbers: str) -> tuple[Any, dict[str, float]]:
     """
     if not path.is_file():
         raise RunError(f"{path} does not exist; start without --resume")
-    with np.load(path, allow_pickle=False) as file:
-        found = dict(file)
     leaves, treedef = jax.tree.flatten_with_path(like)
-    names = [jax.tree_util.keystr(where) for where, _ in leaves]
-    made = [_fitting(path, name, found.get(f"tree{name}"), x) for name, (_, x) in zip(names, leaves, strict=True)]
-    return jax.tree.unflatten(treedef, made), {name: float(x) for name, x in found.items() if name in numbers}
+    names = [f"tree{jax.tree_util.keystr(where)}" for where, _ in leaves]
+    with np.load(path, allow_pickle=False) as file:
+        found = {name: file[name] for name in [*names, *numbers] if name in file}
+    made = [_fitting(path, name, found.get(name), x) for name, (_, x) in zip(names, leaves, strict=True)]
+    return jax.tree.unflatten(treedef, made), {name: float(found[name]) for name in numbers}
+
+
+class Learnt(NamedTuple):
+    """The part of a learner that acts."""
+
+    networks: Networks
+    normalizer: Normalizer
+
+
+def load_policy(folder: Path, env: Environment) -> Learnt:
+    """What a run has learnt.
+
+    Raises:
+        RunError: there is no such run, or it does not fit the environment.
+    """
+    fields = {field.name for field in dataclasses.fields(PPOConfig)}
+    config = PPOConfig(**{name: _frozen(value) for name, value in settings(folder).items() if name in fields})
+    none = jnp.zeros(observed(env)[0])
+    like = Learnt(init_networks(jax.random.key(0), env, config), Normalizer(jnp.zeros(()), none, none))
+    return load(folder / POLICY, like)[0]
 
 
 def _fitting(path: Path, name: str, array: np.ndarray | None, like: jax.Array) -> jax.Array:
@@ -565,6 +672,7 @@ def train(
         report(_line(rows[-1]))
         if time.perf_counter() - saved > checkpoint_seconds or number == config.iterations:
             save(out / "checkpoint.npz", learner, iterations=number, seconds=rows[-1]["seconds"])
+            save(out / POLICY, Learnt(learner.networks, learner.normalizer))
             saved = time.perf_counter()
     return Trained(learner, rows, _noiseless(env, config, learner, step, jit))
 
@@ -612,7 +720,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(description="PPO on one LIBERO task.")
     made.add_argument("--suite", default="libero_object")
-    made.add_argument("--task", type=int, default=0)
+    made.add_argument("--task", type=_task, default=0, help="a number, or all: one after another, each in a folder")
     made.add_argument("--objective", choices=OBJECTIVES, default="reach")
     made.add_argument("--target", help="what to reach or lift; the first object the task is about by default")
     made.add_argument("--geometry", choices=PROFILES, default="lean")
@@ -623,7 +731,14 @@ def parser() -> argparse.ArgumentParser:
         default="position",
         help="position: osc without rotations, the hand stays upright",
     )
+    made.add_argument(
+        "--obs", choices=("state", "pixels"), default="state", help="pixels: images and the robot's joints"
+    )
+    made.add_argument("--image-size", type=_whole, default=64)
     made.add_argument("--placement", choices=functional.PLACEMENTS, default="stored")
+    made.add_argument(
+        "--hold-back", type=_whole, default=0, help="so many of the stored starts, the last, are not used"
+    )
     made.add_argument("--scenes", help="a folder that `vecenv compile` wrote, in place of the installed packages")
     made.add_argument("--out", type=Path, required=True, help="folder for curve, checkpoint and result")
     made.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
@@ -636,6 +751,11 @@ def parser() -> argparse.ArgumentParser:
             type=float if kind is float else _whole,
         )
     return made
+
+
+def _task(text: str) -> int | str:
+    """The number of a task, or all."""
+    return text if text == "all" else _whole(text)
 
 
 def _whole(text: str) -> int:
@@ -656,21 +776,33 @@ class Upright:
     action_size = 4
 
     def __init__(self, env: functional.FunctionalLibero) -> None:
-        self._env, self.observation_size, self.reset = env, env.observation_size, env.reset
+        self.inner, self.observation_size, self.reset = env, env.observation_size, env.reset
 
     def step(self, state: functional.FunctionalState, action: jax.Array) -> functional.FunctionalState:
         """Advance by one step; ``action`` is [4]."""
-        return self._env.step(state, jnp.zeros(7, action.dtype).at[jnp.array([0, 1, 2, 6])].set(action))
+        return self.inner.step(state, upright(action))
+
+
+def upright(action: Any) -> jax.Array:
+    """OSC actions [..., 7] that do as actions of position and gripper [..., 4] say."""
+    action = jnp.asarray(action)
+    still = jnp.zeros((*action.shape[:-1], 3), action.dtype)
+    return jnp.concatenate([action[..., :3], still, action[..., 3:]], axis=-1)
 
 
 def make_env(args: argparse.Namespace) -> functional.FunctionalLibero:
     """The task that the command line asks for, with the shaped reward."""
+    if not 0 <= args.hold_back < NUM_EPISODES:
+        raise RunError(f"--hold-back {args.hold_back}: there are {NUM_EPISODES} stored starts")
     same = ("objective", "target", "geometry", "placement", "scenes", "episode_length")
     return functional.FunctionalLibero(
         args.suite,
         task=args.task,
         config_overrides={
             **{name: getattr(args, name) for name in same},
+            "episodes": tuple(range(NUM_EPISODES - args.hold_back)),
+            "obs": ("proprio", "objects") if args.obs == "state" else ("proprio", "pixels"),
+            "image_size": args.image_size,
             "reward": "shaped",
             "impl": None if args.impl == "auto" else args.impl,
             "action": "osc" if args.action == "position" else args.action,
@@ -683,21 +815,31 @@ def main(argv: Sequence[str] | None = None) -> None:
     command = parser()
     args = command.parse_args(argv)
     try:
-        if args.resume:
-            command.set_defaults(**_settings(args.out))
-            args = command.parse_args(argv)
-        config = PPOConfig(
-            **{field.name: _frozen(getattr(args, field.name)) for field in dataclasses.fields(PPOConfig)}
-        )
-        env = make_env(args)
-        args.out.mkdir(parents=True, exist_ok=True)
-        (args.out / SETTINGS).write_text(json.dumps({**vars(args), "out": str(args.out)}, indent=1))
-        trained = train(Upright(env) if args.action == "position" else env, config, args.out, resume=args.resume)
+        if args.task == "all":
+            for task in range(
+                len(installed_tasks(args.suite) if args.scenes is None else exported_tasks(args.scenes, args.suite))
+            ):
+                _train(command, [*(argv or sys.argv[1:]), "--task", str(task), "--out", str(args.out / f"task_{task}")])
+        else:
+            _train(command, argv)
     except (ValueError, LookupError, RuntimeError) as error:
         # What these say is meant for users; anything else is a defect and keeps its traceback.
         if not type(error).__module__.startswith(("vecenv", __name__)):
             raise
         command.error(str(error))
+
+
+def _train(command: argparse.ArgumentParser, argv: Sequence[str] | None) -> None:
+    """Train on one task."""
+    args = command.parse_args(argv)
+    if args.resume:
+        command.set_defaults(**settings(args.out))
+        args = command.parse_args(argv)
+    config = PPOConfig(**{field.name: _frozen(getattr(args, field.name)) for field in dataclasses.fields(PPOConfig)})
+    env = make_env(args)
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / SETTINGS).write_text(json.dumps({**vars(args), "out": str(args.out)}, indent=1))
+    trained = train(acting(env, args.action), config, args.out, resume=args.resume)
     result = _result(env, config, trained)
     (args.out / "result.json").write_text(json.dumps(result, indent=1))
     print(json.dumps(result))
@@ -705,7 +847,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         print("no curve.png: matplotlib is not installed")
 
 
-def _settings(out: Path) -> dict[str, Any]:
+def acting(env: functional.FunctionalLibero, action: str) -> Environment:
+    """The environment, acted on as ``--action`` says."""
+    return Upright(env) if action == "position" else env
+
+
+def settings(out: Path) -> dict[str, Any]:
     """Options of the run that is resumed."""
     try:
         found = json.loads((out / SETTINGS).read_text())

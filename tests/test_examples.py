@@ -53,7 +53,7 @@ class Point:
 
     pos: jax.Array
     goal: jax.Array
-    obs: jax.Array
+    obs: Any
     reward: jax.Array
     done: jax.Array
     metrics: dict[str, jax.Array]
@@ -95,6 +95,15 @@ class Clock:
         return Point(pos, goal, jnp.concatenate([pos, goal]), pos[0], there, {"success": there})
 
 
+class Flags(PointMass):
+    """As before, seen in images."""
+
+    observation_size: Any
+
+    def __init__(self, *shapes: tuple[int, ...]) -> None:
+        self.observation_size = {"state": (3,), **{f"pixels/view_{n}": shape for n, shape in enumerate(shapes)}}
+
+
 SMALL = ppo.PPOConfig(
     steps=20_000, num_envs=64, episode_length=30, minibatches=8, hidden=(32, 32), learning_rate=3e-3, initial_std=0.6
 )
@@ -114,6 +123,33 @@ def test_ppo_learns_to_go_to_a_place(tmp_path: Path) -> None:
     assert trained.success > 0.95
     assert trained.rows[-1]["env_steps"] >= SMALL.steps
     assert ppo.plot(tmp_path / "curve.png", trained.rows, "point mass") == (tmp_path / "curve.png").is_file()
+
+
+def test_images_are_seen_by_policy_and_value_function() -> None:
+    rng, env = np.random.default_rng(0), Flags((36, 36, 1), (36, 36, 1))
+    networks = ppo.init_networks(jax.random.key(0), env, SMALL)
+    views = {f"pixels/view_{n}": jnp.asarray(rng.uniform(size=(2, 36, 36, 1)), jnp.float32) for n in range(2)}
+    obs = ppo.packed({"state": jnp.zeros((2, 3)), **views})
+    assert obs.images is not None
+    assert (obs.images.shape, obs.images.dtype) == ((2, 36, 36, 2), jnp.uint8)
+    np.testing.assert_allclose(obs.images[..., 1] / 255, views["pixels/view_1"][..., 0], atol=0.5 / 255 + 1e-6)
+
+    def outcome(networks: Any) -> jax.Array:
+        return ppo.policy_of(networks, obs)[0].sum() + ppo.value_of(networks, obs).sum()
+
+    gradient = jax.grad(outcome)(networks)
+    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient.vision))
+    blank = obs._replace(images=jnp.zeros_like(obs.images))
+    assert np.abs(ppo.value_of(networks, obs) - ppo.value_of(networks, blank)).max() > 0
+    assert ppo.Normalizer(jnp.ones(()), jnp.zeros(3), jnp.ones(3))(obs).images is obs.images
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"), [(((36, 36, 1), (40, 40, 1)), "expected one shape"), (((16, 16, 3),), "too small")]
+)
+def test_images_that_do_not_fit_are_refused(shapes: tuple[tuple[int, ...], ...], message: str) -> None:
+    with pytest.raises(ppo.RunError, match=message):
+        ppo.init_networks(jax.random.key(0), Flags(*shapes), SMALL)
 
 
 def test_a_run_that_was_interrupted_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
@@ -167,6 +203,7 @@ def test_advantages_are_those_of_a_plain_loop() -> None:
     terminated = rng.random((ticks, worlds)) < 0.2
     ended = terminated | (rng.random((ticks, worlds)) < 0.2)
     zeros = np.zeros((ticks, worlds, 2), np.float32)
+    obs, following = ppo.Obs(obs, None), ppo.Obs(following, None)
     data = ppo.Transition(obs, zeros, reward, reward, following, terminated, ended)
     found, targets = ppo.advantages(networks, normalizer, data, SMALL)
     value = np.asarray(ppo.value_of(networks, obs))
@@ -196,7 +233,7 @@ def test_the_normalizer_keeps_mean_and_variance_of_all_it_saw() -> None:
     everything = np.concatenate(parts).reshape(-1, 4)
     np.testing.assert_allclose(normalizer.mean, everything.mean(0), rtol=1e-4)
     np.testing.assert_allclose(normalizer.var, everything.var(0), rtol=1e-4)
-    assert normalizer(jnp.full(4, 1e9)).tolist() == [10.0] * 4
+    assert normalizer(ppo.Obs(jnp.full(4, 1e9), None)).vector.tolist() == [10.0] * 4
 
 
 def test_repeated_actions_stop_where_an_episode_ends() -> None:

@@ -158,7 +158,27 @@ def test_it_steps_as_the_batched_environment_does(plain: Compiled, state: Functi
     columns = [plain.env.layout[name] for name in ("eef_pos", "finger_pos")]
     seen = batched.observe_egocentric().state[:, [0, 1, 2, 6, 7]]
     np.testing.assert_allclose(np.concatenate([state.obs[:, c] for c in columns], axis=1), seen, atol=1e-5)
+    np.testing.assert_allclose(plain.env.observe_batch(batched.physics), state.obs, atol=1e-5)
     batched.close()
+
+
+def test_a_batch_of_another_scene_or_with_images_is_not_observed() -> None:
+    env = vecenv.make("libero_goal", tasks=[0], episodes=[0], backend="native")
+    assert isinstance(env, LiberoEnv)
+    env.reset()
+    assert made().observe_batch(env.physics, []).shape == (0, made().observation_size)
+    with pytest.raises(FunctionalError, match="slot 0 simulates another scene"):
+        made().observe_batch(env.physics)
+    env.close()
+
+
+def test_a_batch_with_other_geometry_is_observed_likewise() -> None:
+    env = vecenv.make("libero_object", tasks=[0], episodes=[3], backend="native")
+    assert isinstance(env, LiberoEnv)
+    env.reset()
+    lean = FunctionalLibero("libero_object", task=0, config_overrides={"geometry": "lean", "budget": BUDGET})
+    np.testing.assert_allclose(lean.observe_batch(env.physics), made().observe_batch(env.physics), atol=2e-3)
+    env.close()
 
 
 def test_non_finite_actions_count_as_zero_and_large_ones_are_clipped(plain: Compiled, state: FunctionalState) -> None:

@@ -131,6 +131,38 @@ def test_the_goal_is_reached_with_the_soup_in_the_basket() -> None:
     assert potential(goal, view(data)) == pytest.approx(1.0)
 
 
+def test_carrying_to_a_place_pays_for_every_stage() -> None:
+    scene, problem = task()
+    goal = Objective(scene, problem, "goal")
+    data, grip = start(), scene.grip_site
+    pos, basket = soup(data), data.site("basket_1_contain_region").xpos.copy()
+    hand = data.site_xpos[grip].copy()
+    potentials = {}
+
+    def at(stage: str, place: np.ndarray, gripper: float = OPEN, held: bool = False) -> None:
+        put_soup(data, place)
+        if held:
+            data.site_xpos[grip] = place
+        potentials[stage] = potential(goal, view(data, gripper))
+        data.site_xpos[grip] = hand
+
+    at("hand away", pos)
+    at("hand at it", pos, held=True)
+    at("closed", pos, -OPEN, held=True)
+    at("raised", pos + [0, 0, 0.05], -OPEN, held=True)
+    at("above the rim", pos + [0, 0, 0.25], -OPEN, held=True)
+    at("above the basket", basket + [0, 0, 0.2], -OPEN, held=True)
+    at("lowered", basket + [0, 0, 0.1], -OPEN, held=True)
+    assert list(potentials.values()) == sorted(set(potentials.values())), potentials
+    # Letting go there costs nothing: what remains is to fall.
+    at("let go", basket + [0, 0, 0.1], OPEN)
+    assert potentials["let go"] >= potentials["lowered"] - 1e-3
+    # Nor does it pay to push the thing against the basket on the ground.
+    at("pushed", np.array([*(basket[:2] + 0.6 * (pos - basket)[:2]), pos[2]]), held=True)
+    assert potentials["pushed"] < potentials["raised"]
+    assert max(potentials.values()) < 1
+
+
 def test_opening_a_drawer_counts_by_how_far_it_is_open() -> None:
     scene, problem = task("libero_goal", 0)
     assert problem.goal[0].name == "open"

@@ -23,6 +23,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from mujoco import mjx
 
@@ -43,7 +44,7 @@ from vecenv.libero.functional.physics import WorldPhysics
 from vecenv.libero.functional.randomize import Randomizer, Variation
 from vecenv.libero.functional.starts import Starts
 from vecenv.libero.functional.state import FunctionalState
-from vecenv.libero.physics.base import SUBSTEPS
+from vecenv.libero.physics.base import SUBSTEPS, Physics
 from vecenv.libero.physics.mjx import model as mjx_model
 from vecenv.libero.render.raytrace import RayTracer
 from vecenv.libero.render.scenery import Scenery
@@ -160,6 +161,23 @@ class FunctionalLibero:
             metrics={**state.metrics, **metrics},
             info={**state.info},
         )
+
+    def observe_batch(
+        self, physics: Physics, slots: Sequence[int] | None = None
+    ) -> Float[np.ndarray, "slots observation_size"]:
+        """Observations of a batched environment, as a policy that was trained on this one takes them.
+
+        Args:
+            physics: ``env.physics`` of an environment of ``vecenv.make``, of any backend and geometry.
+            slots: indices of the slots to observe, which must simulate this scene; None for all.
+
+        Returns:
+            A row a slot, in the columns of ``layout``, float32.
+
+        Raises:
+            FunctionalError: another scene, or observations with images.
+        """
+        return self._observer.of_batch(physics, range(physics.num_envs) if slots is None else slots)
 
     def _model(self, variation: Variation | None) -> mjx.Model:
         """The model of a world with this variation."""
