@@ -215,7 +215,7 @@ def test_advantages_are_those_of_a_plain_loop() -> None:
             delta = reward[t, world] + SMALL.discount * onwards - value[t, world]
             later = delta + (0.0 if ended[t, world] else SMALL.discount * SMALL.gae * later)
             assert found[t, world] == pytest.approx(later, rel=1e-4, abs=1e-5)
-    np.testing.assert_allclose(targets, found + value, rtol=1e-5)
+    np.testing.assert_allclose(targets, found + value, rtol=1e-5, atol=1e-6)
 
 
 def test_log_probabilities_are_those_of_a_normal_distribution() -> None:
