@@ -75,6 +75,7 @@ class PPOConfig:
         max_grad_norm: gradients are scaled down to this norm.
         hidden: widths of the hidden layers of policy and value function.
         initial_std: of the noise on actions; learnt from there on.
+        min_std: it never gets smaller than this, so that something remains to be found out.
         seed: of everything random.
     """
 
@@ -93,6 +94,7 @@ class PPOConfig:
     max_grad_norm: float = 1.0
     hidden: tuple[int, ...] = (256, 256, 128)
     initial_std: float = 0.6
+    min_std: float = 0.05
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -382,7 +384,7 @@ def rollout(
     def tick(worlds: Worlds, rng: jax.Array) -> tuple[Worlds, tuple[Transition, Statistics]]:
         act, reset = jax.random.split(rng)
         obs = packed(worlds.state.obs)
-        mean, std = policy_of(networks, normalizer(obs))
+        mean, std = policy_of(networks, normalizer(obs), config.min_std)
         action = mean + noise * std * jax.random.normal(act, mean.shape)
         after, reward = advance(env, worlds.state, action, config.action_repeat)
         terminated = after.done > 0
@@ -472,7 +474,7 @@ class Batch(NamedTuple):
 
 def loss_of(networks: Networks, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The clipped objective (Schulman et al. 2017, eq. 9), and what to watch."""
-    mean, std = policy_of(networks, batch.obs)
+    mean, std = policy_of(networks, batch.obs, config.min_std)
     log_ratio = log_probability(mean, std, batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)

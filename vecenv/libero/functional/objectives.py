@@ -201,9 +201,9 @@ class Objective:
         for the height gained.
         ``goal``: the mean over the goal's predicates: 1 if one holds. Of one that brings an object to a place, while
         it does not hold: 0.2 for raising the object by 5 cm, 0.15 for raising it to 3 cm above what stands around the
-        place (a basket's rim), 0.25 for nearing the place horizontally at that height, 0.1 for lowering it there; and
+        place (a basket's rim), 0.2 for nearing the place horizontally at that height, 0.1 for lowering it there; and
         for the first such predicate 0.1 for the hand's nearness to the object and 0.1 for closing it there, which an
-        object above its place no longer needs. Of other ones 0.6 for nearness of the thing to its place, of the joint
+        object above its place no longer needs, and there 0.05 for opening the hand. Of other ones 0.6 for nearness of the thing to its place, of the joint
         to its bound, and for the first 0.3 for nearness of the hand to the thing.
         """
         if self.kind == "reach":
@@ -246,7 +246,9 @@ class Objective:
         raised = jnp.maximum(jnp.clip(bottom / _RAISED, 0, 1), above)
         lowered = above * _score(safe_norm(away))
         near, closing = (jnp.maximum(part, above) for part in self._held(view, box))
-        return 0.2 * raised + 0.15 * high + 0.25 * high * _score(flat) + 0.1 * lowered, 0.1 * near + 0.1 * closing
+        opened = above * (1 + view.gripper[0]) / 2
+        carried = 0.2 * raised + 0.15 * high + 0.2 * high * _score(flat) + 0.1 * lowered
+        return carried, 0.1 * near + 0.1 * closing + 0.05 * opened
 
     def _holds(self, view: View) -> Bool[Array, " P"]:
         """Which predicates of the goal hold, bool [P]."""
