@@ -275,11 +275,10 @@ def apply_layers(layers: Layers, x: jax.Array) -> jax.Array:
     return x @ layers[-1]["weight"] + layers[-1]["bias"]
 
 
-def policy_of(networks: Networks, obs: Obs) -> tuple[jax.Array, jax.Array]:
+def policy_of(networks: Networks, obs: Obs, min_std: float = 0.05) -> tuple[jax.Array, jax.Array]:
     """Mean [..., A] in (-1, 1) and standard deviation [A] of the action for normalised observations."""
-    return jnp.tanh(apply_layers(networks.policy, features(networks, obs))), jnp.exp(
-        jnp.clip(networks.log_std, -3, 0.5)
-    )
+    std = jnp.exp(jnp.clip(networks.log_std, math.log(min_std), 0.5))
+    return jnp.tanh(apply_layers(networks.policy, features(networks, obs))), std
 
 
 def value_of(networks: Networks, obs: Obs) -> jax.Array:
