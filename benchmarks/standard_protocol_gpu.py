@@ -76,7 +76,7 @@ def measure(geometry: str, options: argparse.Namespace) -> dict[str, Any]:
         )
         seconds = time.perf_counter() - started
         if done.returncode:
-            raise RuntimeError(f"{command[3:]} failed:\n{(done.stdout + done.stderr)[-3000:]}")
+            raise RuntimeError(f"{command[3:]} failed:\n{(done.stdout + done.stderr)[-3000:]}\n{_errors(Path(folder))}")
         ticks = _ticks(Path(folder))
     print(done.stdout[-2000:], flush=True)
     return {
@@ -84,6 +84,12 @@ def measure(geometry: str, options: argparse.Namespace) -> dict[str, Any]:
         "episodes": len(options.suites) * TASKS * EPISODES,
         "steps/s": round(ticks / seconds),
     }
+
+
+def _errors(folder: Path) -> str:
+    """What the logs of the runs say about errors, the last of each."""
+    logs = [f"{path.relative_to(folder)}: {path.read_text()[-1500:]}" for path in folder.rglob("errors.log")]
+    return "\n".join(logs)
 
 
 def _ticks(folder: Path) -> int:

@@ -791,8 +791,8 @@ def upright(action: Any) -> jax.Array:
     return jnp.concatenate([action[..., :3], still, action[..., 3:]], axis=-1)
 
 
-def make_env(args: argparse.Namespace) -> functional.FunctionalLibero:
-    """The task that the command line asks for, with the shaped reward."""
+def make_env(args: argparse.Namespace, **more: Any) -> functional.FunctionalLibero:
+    """The task that the command line asks for, with the shaped reward and more options."""
     if not 0 <= args.hold_back < NUM_EPISODES:
         raise RunError(f"--hold-back {args.hold_back}: there are {NUM_EPISODES} stored starts")
     same = ("objective", "target", "geometry", "placement", "scenes", "episode_length")
@@ -807,6 +807,7 @@ def make_env(args: argparse.Namespace) -> functional.FunctionalLibero:
             "reward": "shaped",
             "impl": None if args.impl == "auto" else args.impl,
             "action": "osc" if args.action == "position" else args.action,
+            **more,
         },
     )
 

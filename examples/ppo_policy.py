@@ -10,7 +10,6 @@ evaluation's own scenes are simulated; of the scene that was trained on only the
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import ppo
 from vecenv.contract import ACTION_DIM, BatchEnv, ResetInfo
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.functional import FunctionalLibero
+from vecenv.libero.physics.budgets import Budget
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,8 @@ class PpoPolicy:
             raise ppo.RunError(
                 f"{folder} was trained with --obs {args.obs} --action {args.action}, not on vectors with OSC"
             )
-        env = ppo.make_env(argparse.Namespace(**{**vars(args), "scenes": None, "impl": "jax"}))
+        # It is never stepped, so it needs no memory for contacts.
+        env = ppo.make_env(args, scenes=None, impl="jax", budget=Budget(contacts=1, rows=1, pairs=1, candidates=1))
         learnt = ppo.load_policy(folder, ppo.acting(env, args.action))
         mean = jax.jit(lambda obs: ppo.policy_of(learnt.networks, learnt.normalizer(ppo.packed(obs)))[0])
 

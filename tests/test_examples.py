@@ -19,7 +19,10 @@ import numpy as np
 import pytest
 from support.paths import REPOSITORY
 
+import vecenv
 from vecenv import interop
+from vecenv.libero.env import LiberoEnv
+from vecenv.libero.physics.budgets import Budget
 
 pytest.importorskip("optax")
 
@@ -150,6 +153,40 @@ def test_images_are_seen_by_policy_and_value_function() -> None:
 def test_images_that_do_not_fit_are_refused(shapes: tuple[tuple[int, ...], ...], message: str) -> None:
     with pytest.raises(ppo.RunError, match=message):
         ppo.init_networks(jax.random.key(0), Flags(*shapes), SMALL)
+
+
+def test_what_was_learnt_acts_in_an_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    policies = imported("ppo_policy")
+    own = sys.modules["ppo"]
+    options = vars(own.parser().parse_args(["--objective", "goal", "--hidden", "8", "--out", str(tmp_path)]))
+    (tmp_path / own.SETTINGS).write_text(json.dumps({**options, "out": "", "hidden": [8], "action_repeat": 2}))
+    env = vecenv.make("libero_object", tasks=[0], episodes=[3, 4])
+    assert isinstance(env, LiberoEnv)
+    with env:
+        info = env.reset()
+        with pytest.raises(own.RunError, match=r"policy.npz does not exist"):
+            policies.PpoPolicy(str(tmp_path)).reset(env, info)
+        budget = Budget(contacts=1, rows=1, pairs=1, candidates=1)
+        inner = own.make_env(own.parser().parse_args(["--out", "x"]), impl="jax", budget=budget)
+        shape = dataclasses.replace(SMALL, hidden=(8,))
+        networks = own.init_networks(jax.random.key(0), own.Upright(inner), shape)
+        networks = networks._replace(policy=jax.tree.map(lambda x: x + 0.05, networks.policy))
+        normalizer = own.Normalizer(jnp.ones(()), jnp.zeros(inner.observation_size), jnp.ones(inner.observation_size))
+        own.save(tmp_path / own.POLICY, own.Learnt(networks, normalizer))
+        policy = policies.PpoPolicy(str(tmp_path))
+        policy.reset(env, info)
+        actions = policy.act(env)
+        obs = own.Obs(jnp.asarray(inner.observe_batch(env.physics)), None)
+        mean = np.asarray(own.policy_of(networks, normalizer(obs))[0])
+        assert actions.shape == (2, 2, 7)
+        np.testing.assert_allclose(actions[:, 0][:, [0, 1, 2, 6]], mean, atol=1e-6)
+        np.testing.assert_array_equal(actions[:, 0], actions[:, 1])
+        assert not actions[..., 3:6].any()
+        assert np.abs(actions[0] - actions[1]).max() > 0  # they see different starts
+    other = vecenv.make("libero_object", tasks=[1], episodes=[0])
+    with other, pytest.raises(own.RunError, match=r"trained on libero_object 0, not on libero_object 1"):
+        policy.reset(other, other.reset())
 
 
 def test_a_run_that_was_interrupted_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:

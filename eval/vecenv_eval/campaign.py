@@ -17,6 +17,7 @@ from typing import Any
 
 from vecenv.util.tables import Column, FittedTable
 from vecenv_eval.config import ConfigError, EvalConfig
+from vecenv_eval.engine import engine_class
 from vecenv_eval.results import CAMPAIGN, EvalResult, Progress, open_or_begin, refuse_other_settings
 from vecenv_eval.runner import Evaluation, check
 from vecenv_eval.simulator import Simulator, vecenv_simulator
@@ -156,19 +157,20 @@ class Campaign:
         write_campaign(self.config, self.folder)
         results: list[EvalResult] = []
         summary = summarise((), ())
-        for leg in self.legs:
-            store = open_or_begin(leg.config, leg.folder)
-            on_begin(leg, store)
+        with engine_class(self.config).shared():
+            for leg in self.legs:
+                store = open_or_begin(leg.config, leg.folder)
+                on_begin(leg, store)
 
-            def report(progress: Progress, leg: Leg = leg) -> None:
-                on_progress(leg, progress)
+                def report(progress: Progress, leg: Leg = leg) -> None:
+                    on_progress(leg, progress)
 
-            result = Evaluation(leg.config, self._simulator).run(store, report)
-            results.append(result)
-            on_result(leg, result)
-            summary = self.write_summary(results)
-            if result.interrupted:
-                break
+                result = Evaluation(leg.config, self._simulator).run(store, report)
+                results.append(result)
+                on_result(leg, result)
+                summary = self.write_summary(results)
+                if result.interrupted:
+                    break
         return summary, results
 
     def write_summary(self, results: Sequence[EvalResult]) -> CampaignSummary:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
@@ -73,12 +74,26 @@ class Engine(Protocol):
         """
         ...
 
+    @classmethod
+    def shared(cls) -> AbstractContextManager[None]:
+        """Within it, runs one after another share what takes long to start."""
+        ...
+
 
 def make_engine(config: EvalConfig) -> Engine:
     """The engine that a config names.
 
     Raises:
         ConfigError: there is no such engine, it does not take the arguments, or its package is not installed.
+    """
+    return engine_class(config)(config)
+
+
+def engine_class(config: EvalConfig) -> type[Engine]:
+    """The class of the engine that a config names.
+
+    Raises:
+        ConfigError: there is no such engine, or its package is not installed.
     """
     if config.engine not in ENGINES:
         raise ConfigError(unknown("engine", config.engine, ENGINES))
@@ -90,4 +105,4 @@ def make_engine(config: EvalConfig) -> Engine:
         if not extra or (error.name or "").startswith("vecenv"):
             raise
         raise ConfigError(f"engine {config.engine!r} needs {error.name}: pip install 'vecenv[{extra}]'") from None
-    return getattr(module, attribute)(config)
+    return getattr(module, attribute)

@@ -30,6 +30,16 @@ class SlowPolicy:
         return np.zeros((env.num_envs, 7))
 
 
+class TellingPolicy(SlowPolicy):
+    """Reports in which process it acts."""
+
+    def __init__(self) -> None:
+        super().__init__(seconds=0)
+
+    def extras(self, slot: int) -> dict[str, int]:
+        return {"process": os.getpid()}
+
+
 class MeetingPolicy(SlowPolicy):
     """Acts once as many processes as ``processes`` have got so far; each leaves a file in ``folder``."""
 

@@ -44,12 +44,18 @@ def compile_command(
     colors: list[str] = typer.Option(
         ["published"], "--colors", help="Colours of images: published or current; may be given again."
     ),
+    budgets: bool = typer.Option(
+        False,
+        "--budgets",
+        help="Also the contact memory that MJX needs, which takes up to a minute a scene to measure.",
+    ),
 ) -> None:
     """Export LIBERO suites into one folder that needs no LIBERO or robosuite files: tasks, starts, scenes, images."""
     from rich.console import Console
     from rich.progress import track
 
     import vecenv
+    from vecenv.libero.contact_memory import export_budgets
     from vecenv.libero.render.exported import export_images, looks
     from vecenv.libero.render.options import RenderError
     from vecenv.libero.scene.bddl_syntax import BDDLError
@@ -85,6 +91,7 @@ def compile_command(
             track=bar,
         )
         drawn = export_images(out, chosen, suite or None, track=bar) if chosen else None
+        measured = export_budgets(out, suite or None, track=bar) if budgets else 0
     except ExportError as error:
         fail(str(error))
     except (BDDLError, SceneError, SettledStartsError, TaskDataError, OSError) as error:
@@ -94,6 +101,8 @@ def compile_command(
     if drawn is not None:
         what = ", ".join(map(str, chosen))
         typer.echo(f"images ({what}): scenes: {drawn.scenes}, {drawn.size / 1e6:.0f} MB in {done.folder}")
+    if budgets:
+        typer.echo(f"contact memory: scenes: {measured}")
 
 
 def warmup_command(

@@ -20,7 +20,7 @@ from vecenv import placement as placing
 from vecenv import protocols
 from vecenv.contract import Control, State
 from vecenv.controllers import waypoint
-from vecenv.libero import observe, starts
+from vecenv.libero import contact_memory, observe, starts
 from vecenv.libero.config import LiberoConfig, LiberoError
 from vecenv.libero.physics.base import SETTLE_ACTION, Group, Physics, Start
 from vecenv.libero.physics.budgets import Budget
@@ -151,7 +151,7 @@ class LiberoEnv(SlotBatch):
         """Memory on MJX: as configured, or measured on the starts of all the suite's tasks in the scene."""
         if self.config.backend == "native" or self.config.budget is not None:
             return self.config.budget
-        return starts.measured_budget(scene, starts.sharing(self._sources, scene_key))
+        return contact_memory.measured_budget(scene, contact_memory.sharing(self._sources, scene_key))
 
     def _goal_table(self, group: Group) -> goals.GoalTable:
         tasks = self._placement.task[group.slots]

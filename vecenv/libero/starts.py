@@ -1,8 +1,7 @@
 """Start states of episodes: stored or settled init states with the fixture poses of the options.
 
 In: a task, its compiled scene, the options of the batch and the episodes. Out: a
-``vecenv.libero.physics.base.Start``, ready to be written into the physics. Also here, because it starts from the same
-states: how much contact memory MJX needs for a scene (``measured_budget``).
+``vecenv.libero.physics.base.Start``, ready to be written into the physics.
 """
 
 from __future__ import annotations
@@ -13,18 +12,13 @@ import numpy as np
 
 from vecenv.errors import InvalidInput
 from vecenv.libero.config import EpisodeRules, LiberoConfig
-from vecenv.libero.physics import budgets, settling
+from vecenv.libero.physics import settling
 from vecenv.libero.physics.base import Start
-from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.scene import goals
-from vecenv.libero.scene.bddl import Problem, SceneKey
+from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.scene import Scene
 from vecenv.libero.tasks import fixtures, settled
 from vecenv.libero.tasks.sources import Task
-from vecenv.libero.tasks.suites import NUM_EPISODES
-
-# Starts of a scene on which its memory on MJX is measured.
-BUDGET_STARTS = 64
 
 
 class StoredStartsError(InvalidInput):
@@ -101,47 +95,3 @@ def _settling_scene(source: Task, problem: Problem, scene: Scene, config: Libero
     if config.geometry == "exact" and config.contacts == "published":
         return scene
     return source.scene(goals.contact_pairs([problem]))
-
-
-def sharing(sources: Sequence[Task], key: SceneKey) -> list[Task]:
-    """The tasks whose scene has this key."""
-    return [task for task in sources if task.problem().scene_key() == key]
-
-
-def measured_budget(scene: Scene, tasks: Sequence[Task]) -> Budget:
-    """Contact and constraint memory on MJX, measured on settled starts of all the tasks that share a scene."""
-    each = -(-BUDGET_STARTS // len(tasks))
-    episodes = np.linspace(0, NUM_EPISODES - 1, min(each, NUM_EPISODES)).astype(int)
-    return budgets.cached(scene, _joined([_central_start(task, scene, episodes) for task in tasks]))
-
-
-def _central_start(task: Task, scene: Scene, episodes: np.ndarray) -> Start:
-    """Settled starts of a task, fixtures at the centres of their regions."""
-    stored = task.settled()
-    bodies, pos, quat = fixtures.poses(
-        task.problem(), scene, "center", keys=[(0, "", 0, 0)] * len(episodes), slots=range(len(episodes))
-    )
-    return Start(
-        qpos=stored.qpos[episodes],
-        qvel=stored.qvel[episodes],
-        bodies=bodies,
-        body_pos=pos,
-        body_quat=quat,
-        settled=True,
-    )
-
-
-def _joined(starts: Sequence[Start]) -> Start:
-    """Settled starts of one scene, one after the other."""
-
-    def join(name: str) -> np.ndarray:
-        return np.concatenate([getattr(start, name) for start in starts])
-
-    return Start(
-        qpos=join("qpos"),
-        qvel=join("qvel"),
-        bodies=starts[0].bodies,
-        body_pos=join("body_pos"),
-        body_quat=join("body_quat"),
-        settled=True,
-    )

@@ -70,6 +70,17 @@ class Seat:
         ).remote(assignment, sys.path)
         self.info, self.waits_for = None, self._actor.prepare.remote()
 
+    def assign(self, assignment: bytes, resources: Mapping[str, float]) -> None:
+        """Let the actor begin another run once it has finished; one that has episodes left, or none, is replaced."""
+        if self.unit:
+            self.retire()
+        self._steps = self._steps_before = self.failed_starts = 0
+        self.scene = None
+        if self._actor is None:
+            self.start(assignment, resources)
+        else:
+            self.info, self.waits_for = None, self._actor.assign.remote(assignment)
+
     def give(self, number: int, episodes: Sequence[Episode], scene: Hashable) -> None:
         """Let the actor run a unit."""
         self.unit, self.scene = dict.fromkeys(episodes), scene
@@ -112,13 +123,30 @@ class Crew:
         size: how many there are.
         assignment: what every actor is told.
         resources: what every actor takes of its node.
+
+    Attributes:
+        resources: likewise.
+        seats: the seats.
     """
 
     def __init__(self, size: int, assignment: Assignment, resources: Mapping[str, float]) -> None:
-        self._assignment, self._resources = cloudpickle.dumps(assignment), resources
+        self.resources = resources
+        self._assignment = cloudpickle.dumps(assignment)
         self.seats = [Seat() for _ in range(size)]
         for seat in self.seats:
             seat.start(self._assignment, resources)
+
+    def assign(self, size: int, assignment: Assignment) -> None:
+        """Begin another run with the same actors, and with more where they are too few.
+
+        Args:
+            size: how many it needs.
+            assignment: what every actor is told.
+        """
+        self._assignment = cloudpickle.dumps(assignment)
+        self.seats += [Seat() for _ in range(size - len(self.seats))]
+        for seat in self.seats:
+            seat.assign(self._assignment, self.resources)
 
     @property
     def active(self) -> list[Seat]:
@@ -128,7 +156,7 @@ class Crew:
     def replace(self, seat: Seat) -> None:
         """Give a seat another actor."""
         seat.retire()
-        seat.start(self._assignment, self._resources)
+        seat.start(self._assignment, self.resources)
 
     def ready(self, timeout_s: float) -> list[Seat]:
         """The seats for which Ray has something; waits until there is one, or for so many seconds."""

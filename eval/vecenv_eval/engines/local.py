@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import AbstractContextManager, nullcontext
 from typing import ClassVar
 
 from vecenv_eval.config import ConfigError, EvalConfig
@@ -23,6 +24,11 @@ class LocalEngine:
     def __init__(self, config: EvalConfig) -> None:
         if config.engine_args:
             raise ConfigError(f"engine 'local' takes no arguments: leave out {', '.join(config.engine_args)}")
+
+    @classmethod
+    def shared(cls) -> AbstractContextManager[None]:
+        """Nothing is shared."""
+        return nullcontext()
 
     def run(
         self, evaluation: Evaluation, store: ResultStore, index: int, on_progress: Callable[[Progress], None]

@@ -170,6 +170,15 @@ class EpisodeActor:
         """Make the policy. Whatever is raised says that this machine lacks something that the driver's has."""
         return self._thread.submit(self._prepare).result()
 
+    def assign(self, assignment: bytes) -> ActorInfo:
+        """Begin another run, in this process: what it has imported and compiled stays.
+
+        Args:
+            assignment: as for the constructor.
+        """
+        self._pickled = assignment
+        return self._thread.submit(self._prepare).result()
+
     def run(self, number: int, episodes: Sequence[Episode]) -> Iterator[Report]:
         """Run a unit of episodes; its reports come as they happen.
 
@@ -190,6 +199,8 @@ class EpisodeActor:
         self._scratch.cleanup()
 
     def _prepare(self) -> ActorInfo:
+        self._close()
+        self._policy, self._loop, self._steps = None, None, 0
         sys.path += [folder for folder in self._path if folder not in sys.path]
         self._given: Assignment = pickle.loads(self._pickled)
         given = self._given

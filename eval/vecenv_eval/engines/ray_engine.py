@@ -4,6 +4,9 @@ Each actor keeps a policy and an environment (``vecenv_eval.engines.ray_actor``)
 units of a scene's episodes (``vecenv_eval.engines.work``) and is the only one that writes the results folder: a record
 is appended as soon as it arrives. Nothing is kept in Ray, so a driver that was killed is resumed like any other run.
 Episodes whose actor was lost run again; if both attempts reported a verdict, the first one stays.
+
+Runs within ``RayEngine.shared()`` keep the Ray instance and the actors: a process that has loaded JAX and its kernels
+begins the next suite in seconds.
 """
 
 from __future__ import annotations
@@ -13,7 +16,8 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -42,6 +46,54 @@ _CONNECT_S = 10.0
 _LAST_REPORTS_S = 2.0
 
 
+class _Kept:
+    """What runs share: a connection to Ray, and the actors of the last run.
+
+    Args:
+        stack: closes the connection.
+    """
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._stack = stack
+        self._options: RayOptions | None = None
+        self._crew: Crew | None = None
+
+    def connect(self, options: RayOptions, wanted: dict[str, float]) -> None:
+        """Be connected as the options say."""
+        if self._options is not None and (self._options.address, self._options.runtime_env) == (
+            options.address,
+            options.runtime_env,
+        ):
+            return
+        self.close()
+        self._stack.close()
+        self._stack.enter_context(_connected(options, wanted))
+        self._options = options
+
+    def crew(self, size: int, assignment: Assignment, wanted: dict[str, float]) -> Crew:
+        """Actors for a run: those of the last one, if they take the same resources."""
+        crew, self._crew = self._crew, None
+        if crew is not None and crew.resources == wanted:
+            crew.assign(size, assignment)
+            return crew
+        if crew is not None:
+            crew.close()
+        return Crew(size, assignment, wanted)
+
+    def keep(self, crew: Crew) -> None:
+        """Leave the actors of a run that went to its end to the next one."""
+        self._crew = crew
+
+    def close(self) -> None:
+        """End the actors."""
+        if self._crew is not None:
+            self._crew.close()
+        self._crew = None
+
+
+_KEPT: ContextVar[_Kept | None] = ContextVar("vecenv_ray_kept", default=None)
+
+
 class RayEngine:
     """Runs episodes on Ray actors; the arguments are the fields of :class:`RayOptions`.
 
@@ -68,16 +120,40 @@ class RayEngine:
         ledger = Ledger(store, evaluation)
         if not ledger.missing:
             return Outcome(interrupted=False, causes=())
-        wanted = resources(self._options, evaluation.config)
         interrupted = False
         driver = _Driver(evaluation, ledger, self._options, on_progress)
         try:
-            with _connected(self._options, wanted):
-                size = self._size(wanted, len(ledger.missing))
-                driver.run(Crew(size, _assignment(evaluation, wanted, index), wanted), index)
+            with ExitStack() as stack:
+                kept = _KEPT.get()
+                if kept is None:
+                    kept = _Kept(stack.enter_context(ExitStack()))
+                    stack.callback(kept.close)
+                self._drive(kept, driver, evaluation, index, len(ledger.missing))
         except KeyboardInterrupt:
             interrupted = True
         return Outcome(interrupted=interrupted, causes=tuple(ledger.causes))
+
+    @classmethod
+    @contextmanager
+    def shared(cls) -> Iterator[None]:
+        """Within it, runs keep the Ray instance and the actors of the one before."""
+        with ExitStack() as stack:
+            kept = _Kept(stack.enter_context(ExitStack()))
+            stack.callback(kept.close)
+            token = _KEPT.set(kept)
+            stack.callback(_KEPT.reset, token)
+            yield
+
+    def _drive(self, kept: _Kept, driver: _Driver, evaluation: Evaluation, index: int, missing: int) -> None:
+        wanted = resources(self._options, evaluation.config)
+        kept.connect(self._options, wanted)
+        crew = kept.crew(self._size(wanted, missing), _assignment(evaluation, wanted, index), wanted)
+        try:
+            driver.run(crew, index)
+        except BaseException:
+            crew.close()
+            raise
+        kept.keep(crew)
 
     def _size(self, wanted: dict[str, float], episodes: int) -> int:
         """How many actors to start.
@@ -137,8 +213,6 @@ class _Driver:
             if not self._ledger.verdicts:
                 raise
             self._ledger.note(str(error))  # what there is makes a result
-        finally:
-            crew.close()
 
     def _run_all(self, episodes: Collection[Episode]) -> bool:
         """Run episodes until each has a record; False when to stop for good."""

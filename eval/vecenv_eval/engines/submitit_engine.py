@@ -13,6 +13,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -92,6 +93,11 @@ class SubmititEngine:
         self._parameters = _parameters(
             config, {name: value for name, value in config.engine_args.items() if name not in own}
         )
+
+    @classmethod
+    def shared(cls) -> AbstractContextManager[None]:
+        """Nothing is shared."""
+        return nullcontext()
 
     def run(
         self, evaluation: Evaluation, store: ResultStore, index: int, on_progress: Callable[[Progress], None]

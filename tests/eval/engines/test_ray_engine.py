@@ -22,6 +22,7 @@ from vecenv_eval.store import EPISODES
 ray = pytest.importorskip("ray")
 pytest.importorskip("ray.cluster_utils")
 
+from vecenv_eval.engines.ray_engine import RayEngine  # noqa: E402
 from vecenv_eval.engines.ray_options import RayOptions, resources, room  # noqa: E402
 
 SLOW = "support.slow_policy:SlowPolicy"
@@ -144,6 +145,36 @@ def test_rows_are_those_of_the_local_engine(tmp_path: Path) -> None:
     assert there.summary.policy == "random"
     assert lines(there.folder) == 20  # every episode once
     assert len({record.batch for record in there.records}) > 4
+
+
+@pytest.mark.usefixtures("cluster")
+def test_runs_that_share_actors_give_the_same_rows_in_the_same_processes(tmp_path: Path) -> None:
+    def processes(result: EvalResult) -> set[Any]:
+        assert result.ok
+        return {record.extras["process"] for record in result.records}
+
+    telling = {"policy": "support.slow_policy:TellingPolicy", "arguments": {"actors": 2}}
+    with RayEngine.shared():
+        first = on_ray(tmp_path / "first", FakeWorld(), tasks="0-1", **telling)
+        second = on_ray(tmp_path / "second", FakeWorld(faults={(2, 1): "broken"}), **telling)
+        third = on_ray(tmp_path / "third", FakeWorld())  # more of them, and another policy
+    alone = on_ray(tmp_path / "alone", FakeWorld(), **telling)
+    assert processes(first) == processes(second)
+    assert processes(alone).isdisjoint(processes(first))
+    here = local(tmp_path / "here", FakeWorld(faults={(2, 1): "broken"}), policy=telling["policy"])
+    assert [{**row, "extras": {}} for row in verdicts(second)] == [{**row, "extras": {}} for row in verdicts(here)]
+    assert verdicts(third) == verdicts(local(tmp_path / "there", FakeWorld()))
+    assert third.summary.policy == "random"
+
+
+@pytest.mark.usefixtures("cluster")
+def test_shared_actors_that_are_lost_are_replaced_for_the_next_run(tmp_path: Path) -> None:
+    with RayEngine.shared():
+        fatal = {"policy": "support.slow_policy:FatalPolicy", "tasks": "0", "episodes": "0", "retries": 0}
+        broken = on_ray(tmp_path / "broken", FakeWorld(), {"actors": 1, "attempts": 1}, **fatal)
+        whole = on_ray(tmp_path / "whole", FakeWorld())
+    assert not broken.ok
+    assert verdicts(whole) == verdicts(local(tmp_path / "here", FakeWorld()))
 
 
 @pytest.mark.usefixtures("cluster")

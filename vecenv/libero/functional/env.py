@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from mujoco import mjx
 
-from vecenv.libero import starts as episode_starts
+from vecenv.libero import contact_memory
 from vecenv.libero.functional.config import (
     ACTIONS,
     CONES,
@@ -89,9 +89,9 @@ class FunctionalLibero:
             raise UnknownTask(f"{suite} has tasks 0 to {len(sources) - 1}, not {task}")
         source, problem = sources[task], sources[task].problem()
         self.instruction = source.instruction
-        sharing = episode_starts.sharing(sources, problem.scene_key())
+        sharing = contact_memory.sharing(sources, problem.scene_key())
         self.scene = _with_cone(_scene(source, sharing, self.config), CONES[self.config.cone])
-        budget = self.config.budget or episode_starts.measured_budget(self.scene, sharing)
+        budget = self.config.budget or contact_memory.measured_budget(self.scene, sharing)
         iterations = self.config.iterations or mjx_model.usual_iterations(self.config.impl, self.config.geometry)
         built = mjx_model.build(
             self.scene,

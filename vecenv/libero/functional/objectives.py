@@ -36,8 +36,8 @@ _SHARPNESS = 5.0
 _GRASP_DEPTH = 0.03
 # Within about this distance of the grasp point closing the hand counts as progress, metres.
 _GRASP_RADIUS = 0.03
-# Off the ground: raised by this much, metres. What is carried passes this far above what stands around its place.
-_RAISED, _CLEARANCE = 0.05, 0.03
+# What is carried passes this far above what stands around its place, and at least this far above the ground, metres.
+_CLEARANCE, _RAISED = 0.03, 0.05
 # Within about this horizontal distance a thing counts as above its place, metres.
 _PLACE_RADIUS = 0.06
 
@@ -200,11 +200,11 @@ class Objective:
         ``lift``: 0.3 for nearness to a point at most 3 cm below the target's top, 0.2 for closing the hand there, 0.5
         for the height gained.
         ``goal``: the mean over the goal's predicates: 1 if one holds. Of one that brings an object to a place, while
-        it does not hold: 0.2 for raising the object by 5 cm, 0.15 for raising it to 3 cm above what stands around the
-        place (a basket's rim), 0.2 for nearing the place horizontally at that height, 0.1 for lowering it there; and
-        for the first such predicate 0.1 for the hand's nearness to the object and 0.1 for closing it there, which an
-        object above its place no longer needs, and there 0.05 for opening the hand. Of other ones 0.6 for nearness of the thing to its place, of the joint
-        to its bound, and for the first 0.3 for nearness of the hand to the thing.
+        it does not hold: 0.25 for raising the object to 3 cm above what stands around the place (a basket's rim), 0.2
+        for nearing the place horizontally at that height, 0.1 for lowering it there; and for the first such predicate
+        0.1 for the hand's nearness to the object and 0.1 for closing it there, which an object above its place no
+        longer needs, and there 0.15 for opening the hand. Of other ones 0.6 for nearness of the thing to its place, of
+        the joint to its bound, and for the first 0.3 for nearness of the hand to the thing.
         """
         if self.kind == "reach":
             return _score(_distance(view, self.box, self._grip(view)))
@@ -243,12 +243,11 @@ class Objective:
         rim = _centre(view, place)[2] + _half_height(view, place) - self._ground
         needed = jnp.maximum(rim + _CLEARANCE, _RAISED)
         high = jnp.maximum(jnp.clip(bottom / needed, 0, 1), above)
-        raised = jnp.maximum(jnp.clip(bottom / _RAISED, 0, 1), above)
         lowered = above * _score(safe_norm(away))
         near, closing = (jnp.maximum(part, above) for part in self._held(view, box))
         opened = above * (1 + view.gripper[0]) / 2
-        carried = 0.2 * raised + 0.15 * high + 0.2 * high * _score(flat) + 0.1 * lowered
-        return carried, 0.1 * near + 0.1 * closing + 0.05 * opened
+        carried = 0.25 * high + 0.2 * high * _score(flat) + 0.1 * lowered
+        return carried, 0.1 * near + 0.1 * closing + 0.15 * opened
 
     def _holds(self, view: View) -> Bool[Array, " P"]:
         """Which predicates of the goal hold, bool [P]."""

@@ -155,7 +155,7 @@ def cached(scene: Scene, starts: Start) -> Budget:
     folder = caching.folder("budgets")
     if folder is None:
         return measure(scene, starts)
-    path = folder / f"{_key(scene.model, starts)}.json"
+    path = folder / f"{key_of(scene, starts)}.json"
     with contextlib.suppress(OSError, ValueError, TypeError):
         return Budget(**json.loads(path.read_bytes()))
     log.info("measuring the contact memory of a scene on native MuJoCo, %d worlds", len(starts.qpos))
@@ -166,7 +166,9 @@ def cached(scene: Scene, starts: Start) -> Budget:
     return budget
 
 
-def _key(model: mujoco.MjModel, starts: Start) -> str:
+def key_of(scene: Scene, starts: Start) -> str:
+    """Names what a budget depends on: model, starts, measurement and the version of MuJoCo."""
+    model = scene.model
     buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     digest = hashlib.sha256(repr((VERSION, RANDOM_TICKS, GRASPING_TICKS, MARGINS, mujoco.__version__)).encode())

@@ -4,7 +4,8 @@ In: suites of the installed packages. Out: a folder with ``index.json`` (MuJoCo 
 instruction, BDDL text and scene), ``scenes/`` (each compiled scene in the two files of ``vecenv.libero.scene.cache``)
 and ``starts/{suite}.npz`` (init states, stored and settled). A scene has the contact sensors of all its exported tasks.
 The index is written last and names the checksum of every file of starts. A compiled model belongs to one version of
-MuJoCo, and so does the folder.
+MuJoCo, and so does the folder. ``budgets.json`` is there where the contact memory of MJX was measured as well
+(``vecenv.libero.contact_memory``).
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from vecenv.util import caching
 INDEX, SCENES, STARTS = "index.json", "scenes", "starts"
 # What is drawn, if the export has it; ``vecenv.libero.render.exported`` writes and reads it.
 IMAGES = "images"
+BUDGETS = "budgets.json"
 # Layout of the folder; raised when it changes.
 FORMAT = 3
 
@@ -60,7 +62,9 @@ class Exported:
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
-def _untracked(items: Sequence[Any], what: str) -> Sequence[Any]:
+def untracked(items: Sequence[Any], what: str) -> Sequence[Any]:
+    """A ``Track`` that shows nothing."""
+    del what
     return items
 
 
@@ -70,7 +74,7 @@ def export(
     *,
     geometries: Sequence[str] = ("exact",),
     contacts: Contacts = "published",
-    track: Track = _untracked,
+    track: Track = untracked,
 ) -> Exported:
     """Write suites into a folder; one that an earlier export wrote is brought up to date.
 
@@ -122,7 +126,7 @@ def _writable(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder}: not a folder; name a new one, or one that an export wrote")
     if folder.is_dir() and not (folder / INDEX).is_file():
-        ours = (SCENES, STARTS, IMAGES)  # left by an export that was interrupted
+        ours = (SCENES, STARTS, IMAGES, BUDGETS)  # left by an export that was interrupted
         others = [path.name for path in folder.iterdir() if path.name not in ours and not path.name.startswith(".")]
         if others:
             raise ExportError(f"{folder}: not an export, it holds {min(others)}; name a new folder")
@@ -176,6 +180,11 @@ def _write_suite(
         for spec in specs
     ]
     return {"starts": hashlib.sha256(data).hexdigest(), "tasks": entries}
+
+
+def write_budgets(folder: Path, budgets: Mapping[str, Mapping[str, int | None]]) -> None:
+    """Write the contact memory of scenes, by ``vecenv.libero.physics.budgets.key_of``, into an exported folder."""
+    caching.write_file(folder / BUDGETS, json.dumps(dict(sorted(budgets.items())), indent=1).encode())
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
@@ -309,6 +318,24 @@ class ExportFolder:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 self._starts[suite] = {name: _frozen(file[name]) for name in file.files}
         return self._starts[suite]
+
+    def budgets(self) -> Mapping[str, Mapping[str, int | None]]:
+        """The numbers of each ``Budget`` by ``vecenv.libero.physics.budgets.key_of``; empty where none was exported.
+
+        Raises:
+            ExportError: the file is damaged.
+        """
+        path = self.path / BUDGETS
+        if not path.exists():
+            return {}
+        try:
+            return {str(key): dict(numbers) for key, numbers in json.loads(self._read(path)).items()}
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise self.budgets_damaged() from error
+
+    def budgets_damaged(self) -> ExportError:
+        """What to raise when the numbers of ``budgets`` make no sense."""
+        return ExportError(f"{self.path / BUDGETS}: damaged: not the budgets of an export; delete it")
 
     def _read(self, path: Path) -> bytes:
         try:
