@@ -42,7 +42,7 @@ from voxposer.pushing import PushError, PushingConfig, PushSituation, PushTask
 from voxposer.quaternions import quaternion
 from voxposer.requests import InterfaceError, MotionRequest
 from voxposer.sandbox.guard import HostFault, Limits
-from voxposer.slots import Grasp, Moving, Pushing, Ready, Slot, pending
+from voxposer.slots import FOLLOWED, Grasp, Moving, Pushing, Ready, Slot, pending
 from voxposer.stops import stops_of, travel
 from voxposer.turns import Turns, TurnsOver
 
@@ -135,6 +135,11 @@ class Agent:
         snapshots = env.observe_objects().snapshot
         names = episodes or ("",) * env.num_envs
         self.slots = [self._slot(*each) for each in zip(instructions, snapshots, names, strict=True)]
+
+    @property
+    def rule_based(self) -> bool:
+        """Whether rules write the programs, and no language model."""
+        return self._llm.config.is_rule_base
 
     def begin(self, instructions: Sequence[str], slots: Sequence[int], episodes: Sequence[str] = ()) -> None:
         """Begin other episodes in some slots, which were just reset; the others continue theirs.
@@ -247,7 +252,7 @@ class Agent:
         if slot.progress.has_next:
             return True
         if slot.progress.passes >= self.config.passes:
-            slot.stop("followed to the end without success")
+            slot.stop(FOLLOWED)
             return False
         slot.progress = replace(slot.progress, passes=slot.progress.passes + 1)
         slot.lmps.set_context(perception.names)

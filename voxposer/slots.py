@@ -23,6 +23,10 @@ from voxposer.pushing import PushTask
 from voxposer.requests import MotionRequest
 
 
+# Why a slot stops that has done all that it was told.
+FOLLOWED = "followed to the end without success"
+
+
 @dataclass(frozen=True)
 class Ready:
     """No motion is pending; the program of the next subtask runs in the next round."""

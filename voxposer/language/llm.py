@@ -91,9 +91,9 @@ class LlmConfig:
         if self.is_rule_base and self.model != OFFLINE_MODEL:
             raise ValueError(f"there is no model {self.model!r}; the rule base is {OFFLINE_MODEL}")
         if self.attempts < 1 or self.timeout_s <= 0 or self.backoff_s < 0 or self.backoff_max_s < 0:
-            raise ValueError(f"attempts must be at least 1, timeout_s above 0 and backoffs not below 0: {self}")
+            raise ValueError("attempts must be at least 1, timeout_s above 0, backoff_s and backoff_max_s not below 0")
         if self.concurrency < 1 or (self.max_tokens is not None and self.max_tokens < 1):
-            raise ValueError(f"concurrency and max_tokens must be at least 1: {self}")
+            raise ValueError("concurrency and max_tokens must be at least 1")
         if self.temperature is not None and not self.temperature >= 0:
             raise ValueError(f"temperature={self.temperature} must not be below 0")
         if reserved := sorted(_RESERVED.intersection(self.options)):

@@ -25,7 +25,7 @@ from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.episodes import Episode, Suite
 from vecenv_eval.loop import EpisodeLoop, make_streams
 from vecenv_eval.memory import choose_slots
-from vecenv_eval.policies import Closing, Policy, make_policy
+from vecenv_eval.policies import Closing, Policy, PolicyUnavailable, make_policy
 from vecenv_eval.results import Progress
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.store import Record
@@ -91,7 +91,7 @@ class Report:
         files: path in the results folder -> content, of videos.
         error: a traceback for ``errors.log``.
         conditions: what the episodes run under.
-        refused: why the environment refuses the config.
+        refused: why the environment refuses the config, or the policy can act in no episode.
         steps: control ticks that the actor has executed, None when that is not reported.
     """
 
@@ -220,7 +220,7 @@ class EpisodeActor:
                 self._loop.run_stream(number, stream)
         except _Stopped:
             pass
-        except ConfigError as error:
+        except (ConfigError, PolicyUnavailable) as error:
             self._outbox.reports.put(Report(refused=str(error)))
         finally:
             self._outbox.reports.put(Report(steps=self._steps))

@@ -17,7 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control, ResetInfo
-from vecenv.errors import InvalidInput
+from vecenv.errors import InvalidInput, ServiceError
 
 BUILTIN = {
     "gr00t": "vecenv_eval.clients.gr00t:Gr00tPolicy",
@@ -34,6 +34,14 @@ BUILTIN = {
 
 class PolicyError(InvalidInput):
     """A policy cannot be made: unknown name, a module that does not import, or arguments it does not take."""
+
+
+class PolicyUnavailable(ServiceError):
+    """A policy can act in no episode of the run, whatever is tried: the run ends at once.
+
+    Its ``act`` raises this, for a key that is wrong or a model that does not exist. The episodes that were running end in
+    an error with the message, and no other begins.
+    """
 
 
 @runtime_checkable
@@ -79,6 +87,30 @@ class Reporting(Protocol):
 
 
 @runtime_checkable
+class Failing(Protocol):
+    """A policy that may be unable to act in single episodes, while the others go on; optional.
+
+    It ends such an episode with ``env.end_episodes``.
+    """
+
+    def error(self, slot: int) -> str:
+        """Why the episode in a slot, which has just finished, has no verdict; "" when it has one.
+
+        The episode is recorded as an error with this cause, not as a failure, and runs again.
+        """
+        ...
+
+
+@runtime_checkable
+class Logging(Protocol):
+    """A policy that keeps a log of each episode, which is stored with the results; optional."""
+
+    def episode_log(self, slot: int) -> Sequence[Mapping[str, Any]]:
+        """Objects for JSON about the episode in a slot so far; written to ``DIR/policy_logs``, one a line."""
+        ...
+
+
+@runtime_checkable
 class Refillable(Protocol):
     """A policy whose slots may begin new episodes one by one; optional.
 
@@ -118,6 +150,11 @@ class Ending(Protocol):
 def extras_of(policy: Policy, slot: int) -> dict[str, Any]:
     """What a policy reports about the episode in a slot; nothing if it reports nothing."""
     return dict(policy.extras(slot)) if isinstance(policy, Reporting) else {}
+
+
+def error_of(policy: Policy, slot: int) -> str:
+    """Why the episode in a slot has no verdict; "" when it has one."""
+    return policy.error(slot) if isinstance(policy, Failing) else ""
 
 
 def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
