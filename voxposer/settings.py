@@ -159,7 +159,9 @@ def option_names() -> list[str]:
 
 def _names_in(config: Any, before: str = "") -> Iterator[str]:
     """The names of all fields of a config or a table of configs, down to those that are no configs."""
-    pairs = config.items() if isinstance(config, Mapping) else ((f.name, getattr(config, f.name)) for f in fields(config))
+    pairs = (
+        config.items() if isinstance(config, Mapping) else ((f.name, getattr(config, f.name)) for f in fields(config))
+    )
     for name, value in pairs:
         full = f"{before}.{name}" if before else name
         if is_dataclass(value) or _is_table(value):

@@ -22,7 +22,6 @@ from voxposer.language.lmp import Lmps
 from voxposer.pushing import PushTask
 from voxposer.requests import MotionRequest
 
-
 # Why a slot stops that has done all that it was told.
 FOLLOWED = "followed to the end without success"
 

@@ -1,8 +1,8 @@
 """One job for each slot, side by side where the slots wait for a language model.
 
 Functions come in, one a slot; all have returned when :meth:`Turns.run` does. One of them runs at a time, so they may
-share what is not made for threads, and nothing depends on their order; inside :meth:`Turns.aside`, where a job waits for
-the model, others go on.
+share what is not made for threads, and nothing depends on their order; inside :meth:`Turns.aside`, where a job waits
+for the model, others go on.
 """
 
 from __future__ import annotations

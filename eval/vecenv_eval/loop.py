@@ -4,9 +4,9 @@ Episodes come as streams (``vecenv_eval.episodes.Stream``): those that the slots
 that follow as slots end. A policy that can begin single slots (``vecenv_eval.policies.Refillable``) gets the next
 episode of a scene in a slot as soon as the one before has ended; any other policy gets batches, one after the other.
 
-An exception costs the episodes that were running: they are written as errors with the cause, and the others still run. A
-policy that could not act in one episode (``vecenv_eval.policies.Failing``) costs that episode; one that can act in none
-(``PolicyUnavailable``) ends the run.
+An exception costs the episodes that were running: they are written as errors with the cause, and the others still run.
+A policy that could not act in one episode (``vecenv_eval.policies.Failing``) costs that episode; one that can act in
+none (``PolicyUnavailable``) ends the run.
 """
 
 from __future__ import annotations

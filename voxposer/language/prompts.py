@@ -41,7 +41,9 @@ def chat_messages(config: LmpConfig, prompt: str, context: str, query: str) -> l
     ]
 
 
-def repair_messages(config: LmpConfig, asked: Sequence[Message], reply: str, error: str, context: str, query: str) -> list[Message]:
+def repair_messages(
+    config: LmpConfig, asked: Sequence[Message], reply: str, error: str, context: str, query: str
+) -> list[Message]:
     """A second request for a query: the first one, its answer, what was wrong with that, and the query again."""
     said = _REPAIR.format(error=" ".join(error.split()))
     return [

@@ -46,7 +46,15 @@ def to_lines(episode: str, calls: Sequence[Call]) -> list[dict[str, Any]]:
                 lines.append({"text": name, "content": text})
             messages.append({"role": message["role"], "text": name})
         values = {name: value for name, value in vars(call).items() if name not in ("messages", "settings", "stop")}
-        lines.append({"episode": episode, **values, "messages": messages, "stop": list(call.stop), "settings": dict(call.settings)})
+        lines.append(
+            {
+                "episode": episode,
+                **values,
+                "messages": messages,
+                "stop": list(call.stop),
+                "settings": dict(call.settings),
+            }
+        )
     return lines
 
 

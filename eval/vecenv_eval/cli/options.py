@@ -172,7 +172,7 @@ def pairs(flag: str, texts: Sequence[str]) -> dict[str, Any]:
             here = here.setdefault(part, {})
             if not isinstance(here, dict):
                 fail(f"{flag} {text!r}: {part} was given a value of its own")
-        if above and last in here or isinstance(here.get(last), dict):
+        if (above and last in here) or isinstance(here.get(last), dict):
             fail(f"{flag} {text!r}: {key} is given twice")
         here[last] = _value(value)
     return pairs

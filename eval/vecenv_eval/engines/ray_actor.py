@@ -193,7 +193,7 @@ class EpisodeActor:
         sys.path += [folder for folder in self._path if folder not in sys.path]
         self._given: Assignment = pickle.loads(self._pickled)
         given = self._given
-        policy = make_policy(given.config.policy_name, seed=given.policy_seed, **given.config.policy_args)
+        policy = make_policy(given.config.policy_name, given.config.policy_args, seed=given.policy_seed)
         self._policy = policy
         self._loop = EpisodeLoop(
             given.config,

@@ -1,6 +1,7 @@
-"""What runs recorded beside their rows, copied from the folders that are merged: demonstrations, videos, logs, datasets.
+"""What runs recorded beside their rows, copied from the folders that are merged.
 
-Only what belongs to a row that is taken over is copied. Files are replaced in one step: a copy is whole or not there.
+That is demonstrations, videos, policies' logs and datasets. Only what belongs to a row that is taken over is copied.
+Files are replaced in one step: a copy is whole or not there.
 """
 
 from __future__ import annotations
@@ -50,9 +51,7 @@ def _copy_demos(store: ResultStore, source: ResultStore, keys: Sequence[Episode]
         copy_demos(source.demos_path(*key), store.demos_path(*key), episodes)
 
 
-def _copy_files(
-    target: Path, source: Path, keys: Sequence[Episode], path_of: Callable[[Path, Episode], Path]
-) -> None:
+def _copy_files(target: Path, source: Path, keys: Sequence[Episode], path_of: Callable[[Path, Episode], Path]) -> None:
     """Copy the file of each episode, where it has one."""
     for key in keys:
         if (path := path_of(source, key)).is_file():

@@ -39,8 +39,8 @@ class PolicyError(InvalidInput):
 class PolicyUnavailable(ServiceError):
     """A policy can act in no episode of the run, whatever is tried: the run ends at once.
 
-    Its ``act`` raises this, for a key that is wrong or a model that does not exist. The episodes that were running end in
-    an error with the message, and no other begins.
+    Its ``act`` raises this, for a key that is wrong or a model that does not exist. The episodes that were running end
+    in an error with the message, and no other begins.
     """
 
 
@@ -157,19 +157,20 @@ def error_of(policy: Policy, slot: int) -> str:
     return policy.error(slot) if isinstance(policy, Failing) else ""
 
 
-def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
+def make_policy(name: str, given: Mapping[str, Any] | None = None, /, *, seed: int = 0, **arguments: Any) -> Policy:
     """Make the policy called ``name``.
 
     Args:
         name: one of ``BUILTIN``, or ``"module:Class"``.
-        seed: passed on to policies whose constructor takes a ``seed`` (unless ``arguments`` already has one).
-        **arguments: constructor arguments.
+        given: constructor arguments, a ``seed`` among them if the policy is to have one of its own.
+        seed: passed on to policies whose constructor takes a ``seed`` (unless ``given`` already has one).
+        **arguments: further constructor arguments.
 
     Raises:
         PolicyError: the name is unknown, its module does not import, it does not take the arguments, or it raises an
             exception.
     """
-    factory = _bound(name, seed, arguments)
+    factory = _bound(name, seed, {**(given or {}), **arguments})
     try:
         policy = factory()
     except PolicyError:
@@ -181,7 +182,7 @@ def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
     return policy
 
 
-def check_policy(name: str, **arguments: Any) -> None:
+def check_policy(name: str, arguments: Mapping[str, Any]) -> None:
     """Raise what ``make_policy`` raises before it makes the policy, which may be a large model."""
     _bound(name, 0, arguments)
 
