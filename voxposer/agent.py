@@ -201,7 +201,8 @@ class Agent:
         """Run the programs of every live slot; those whose questions were not answered end their episodes."""
         asked = {i: len(self.slots[i].lmps.trace) for i in live}
         self._turns.run([partial(self._run_programs, self.slots[i], snapshots[i]) for i in live])
-        _settle([call for i in live for call in self.slots[i].lmps.trace[asked[i] :]])
+        if not self.rule_based:
+            _settle([call for i in live for call in self.slots[i].lmps.trace[asked[i] :]])
         unanswered = [i for i in live if self.slots[i].error]
         if unanswered:
             self.env.end_episodes(unanswered)

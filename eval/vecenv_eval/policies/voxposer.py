@@ -12,6 +12,7 @@ episode ends the run (``PolicyUnavailable``). Every question and reply of an epi
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,11 +23,14 @@ from vecenv.errors import InvalidFile, InvalidInput
 from vecenv_eval.policies import PolicyError, PolicyUnavailable
 from voxposer.agent import Agent, PlannedMotion
 from voxposer.language.lmp_config import Call
-from voxposer.language.replies import LlmError
+from voxposer.language.replies import LlmError, Usage
 from voxposer.language.saved import to_lines
 from voxposer.settings import Settings
 from voxposer.simpler_scene import hands
 from voxposer.slots import Slot
+
+
+_log = logging.getLogger(__name__)
 
 
 class VoxPoserPolicy:
@@ -108,16 +112,31 @@ class VoxPoserPolicy:
         return [] if self.agent is None else to_lines(self._episodes[slot], self.agent.slots[slot].lmps.trace)
 
     def close(self) -> None:
-        """Ask nothing again, and release snapshots and maps."""
+        """Ask nothing again, say what was paid for, and release snapshots and maps."""
         self._llm.close()
+        if not self.settings.llm.is_rule_base:
+            _log.info("%s: %s", self.settings.writer, spent(self._llm.usage))
         if self.agent is not None:
             self.agent.close()
 
 
-def report(agent: Agent, index: int) -> dict[str, Any]:
-    """Subtasks, waypoints, questions, cause and, of a language model, repairs, tokens and cost of one slot, by name.
+def spent(usage: Usage) -> str:
+    """What a run paid for, in a sentence; tokens and price are not shown as 0 where they are not known."""
+    tokens = f"{usage.prompt_tokens + usage.completion_tokens:,} tokens" if usage.uncounted < usage.calls else "tokens"
+    price = f"{usage.cost_usd:.4f} US dollars" if usage.unpriced < usage.calls else "price"
+    if usage.uncounted:
+        tokens += f" (unknown for {usage.uncounted} answers)"
+    if usage.unpriced:
+        price += f" (unknown for {usage.unpriced} answers)"
+    paid = f", {tokens}, {price}" if usage.calls else ""
+    return f"{usage.calls} answers of the model, {usage.retries} attempts repeated, {usage.cached} cached answers{paid}"
 
-    What the cache answered costs nothing: a question that several slots ask is paid by the first.
+
+def report(agent: Agent, index: int) -> dict[str, Any]:
+    """Subtasks, waypoints, questions, cause and, of a language model, repairs, tokens and price of one slot, by name.
+
+    Tokens and price are those of all its answers, also of those that came from the cache and cost nothing this time:
+    they are the same in any batch.
     """
     slot = agent.slots[index]
     calls = slot.lmps.trace
@@ -135,13 +154,12 @@ def report(agent: Agent, index: int) -> dict[str, Any]:
 
 def _of_model(calls: Sequence[Call]) -> dict[str, Any]:
     """What a language model took; None is unknown, because the provider or litellm does not say."""
-    paid = [call for call in calls if call.reply is not None and not call.cached]
-    tokens = [count for call in paid for count in (call.prompt_tokens, call.completion_tokens)]
+    answered = [call for call in calls if call.reply is not None]
+    tokens = [count for call in answered for count in (call.prompt_tokens, call.completion_tokens)]
     return {
         "repairs": sum(bool(call.repair) for call in calls),
-        "llm_cached": sum(call.cached for call in calls),
         "llm_tokens": _sum(tokens),
-        "llm_cost_usd": _sum([call.cost_usd for call in paid]),
+        "llm_cost_usd": _sum([call.cost_usd for call in answered]),
     }
 
 
