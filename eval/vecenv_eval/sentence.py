@@ -15,6 +15,8 @@ from typing import Any, cast
 
 import vecenv
 from vecenv.contract import BatchEnv, Control
+from vecenv.errors import InvalidInput
+from vecenv.util.names import unknown
 from vecenv_eval.policies import make_policy
 from vecenv_eval.policies.voxposer import VoxPoserPolicy, cause
 from vecenv_eval.video.writer import Recordable, recording
@@ -74,6 +76,26 @@ class Followed:
     def ok(self) -> bool:
         """The task's own sentence was solved, or another was followed to its end."""
         return self.success or (not self.own and self.cause == FOLLOWED)
+
+
+def parse_scene(text: str, episode: int) -> tuple[str, int]:
+    """Suite and task of ``"libero_goal/0"`` or ``"simpler/bridge/0"``.
+
+    Raises:
+        InvalidInput: the text has another form, or there is no such task or episode; the message says what there is.
+    """
+    suite, slash, number = text.rpartition("/")
+    if not (slash and number.isdigit() and number.isascii()):
+        raise InvalidInput(f"{text!r}: write SUITE/TASK, such as libero_goal/0")
+    if suite not in vecenv.list_suites():
+        hint = ": write SUITE/TASK, and the episode as --episode N" if suite.rpartition("/")[2].isdigit() else ""
+        raise InvalidInput(f"{text!r}{hint}" if hint else f"{text!r}: {unknown('suite', suite, vecenv.list_suites())}")
+    tasks, episodes = len(vecenv.list_tasks(suite)), vecenv.eval_metadata(suite)["episodes_per_task"]
+    if int(number) >= tasks or not 0 <= episode < episodes:
+        raise InvalidInput(
+            f"{text!r}, episode {episode}: {suite} has tasks 0 to {tasks - 1} and episodes 0 to {episodes - 1}"
+        )
+    return suite, int(number)
 
 
 def follow(

@@ -52,14 +52,10 @@ def run_command(
 
 
 def _followed(task: str, episode: int, sentence: str, options: dict[str, Any], video: Path | None) -> Followed:
-    from vecenv.errors import InvalidInput
-    from vecenv_eval.sentence import follow
-    from voxposer.show import parse_task
+    from vecenv_eval.sentence import follow, parse_scene
 
-    if task.count("/") and task.rsplit("/", 2)[-2].isdigit():
-        raise InvalidInput(f"{task!r}: write SUITE/TASK, and the episode as --episode N")
-    suite, number, index = parse_task(f"{task}/{episode}")
-    return follow(suite, number, index, sentence, options, video=video, on_round=_Rounds())
+    suite, number = parse_scene(task, episode)
+    return follow(suite, number, episode, sentence, options, video=video, on_round=_Rounds())
 
 
 class _Rounds:

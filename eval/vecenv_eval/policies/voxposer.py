@@ -29,7 +29,6 @@ from voxposer.settings import Settings
 from voxposer.simpler_scene import hands
 from voxposer.slots import Slot
 
-
 _log = logging.getLogger(__name__)
 
 
