@@ -125,10 +125,11 @@ def apply(base: _Config, values: Mapping[str, Any], where: str = "") -> _Config:
     hints = typing.get_type_hints(kind)
     made: dict[str, Any] = {}
     for name, value in values.items():
-        old = getattr(base, name)
+        old: Any = getattr(base, name)
         if is_dataclass(old) and isinstance(value, Mapping):
             made[name] = apply(old, value, f"{where}{name}.")
         elif _is_table(old) and isinstance(value, Mapping):
+            assert isinstance(old, Mapping)
             inner = {key: apply(old[key], each, f"{where}{name}.{key}.") for key, each in value.items()}
             made[name] = {**old, **inner}
         elif is_dataclass(old) or _is_table(old):

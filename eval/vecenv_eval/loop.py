@@ -263,7 +263,7 @@ class EpisodeLoop:
         most = 1 if self._config.fail_fast else 2 * len(running.slots)
         if errors and self._errors_in_a_row >= most:
             count = f"{self._errors_in_a_row} episodes in a row ended in an error"
-            raise PolicyUnavailable(f"the run was ended: {count}, the last with {next(reversed(errors.values()))}")
+            raise PolicyUnavailable(f"the run was ended: {count}, the last with {list(errors.values())[-1]}")
 
     def _write_logs(self, running: _Running, slots: Iterable[int]) -> None:
         """Store what the policy notes about episodes; on the disk before their records are."""

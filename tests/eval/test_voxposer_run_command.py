@@ -13,6 +13,7 @@ from support.llm_server import LlmServer, failure, serving
 from support.voxposer_models import CUBE, Writer
 from support.voxposer_world import Obedient, snapshot
 from typer.testing import CliRunner, Result
+from vecenv_eval.cli.options import pairs
 from vecenv_eval.cli.voxposer import voxposer_app
 from vecenv_eval.sentence import follow
 
@@ -160,6 +161,15 @@ def test_wrong_arguments_are_status_2_and_one_sentence(arguments: list[str], say
     assert says in done.output
     assert done.output.startswith("error: ")
     assert done.output.count("\n") == 1
+
+
+def test_names_with_dots_are_nested() -> None:
+    given = ["planner.max_steps=9", "planner.target_spacing=2", "model=gpt-4o", "perception.tilts=[0.1, 0.2]"]
+    assert pairs("--policy-arg", given) == {
+        "planner": {"max_steps": 9, "target_spacing": 2},
+        "model": "gpt-4o",
+        "perception": {"tilts": [0.1, 0.2]},
+    }
 
 
 @needs_gl

@@ -46,7 +46,7 @@ class Writer:
         turn = self.replies.get(asked(request))
         if turn is None:
             return code(PROGRAMS[asked_of(request)])
-        found = turn.pop(0) if len(turn) > 1 else turn[0]
+        found: Any = turn.pop(0) if len(turn) > 1 else turn[0]
         found = found(request) if callable(found) else found
         return code(found) if isinstance(found, str) else found
 

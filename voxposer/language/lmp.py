@@ -184,7 +184,7 @@ class Lmps:
         """The map that a program returns, checked."""
         return self._run(written, self._functions, _nothing, self._as_voxels)
 
-    def _as_voxels(self, written: _Written, value: object) -> np.ndarray:
+    def _as_voxels(self, written: _Written, value: Any) -> np.ndarray:
         tail = (4,) if written.config.name == "get_rotation_map" else ()
         shape = np.shape(value) if isinstance(value, np.ndarray) else (0,)
         if shape != (shape[0],) * 3 + tail:

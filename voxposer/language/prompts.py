@@ -6,6 +6,7 @@ holds.
 
 from __future__ import annotations
 
+import functools
 import re
 import textwrap
 from collections.abc import Sequence
@@ -35,10 +36,16 @@ def chat_messages(config: LmpConfig, prompt: str, context: str, query: str) -> l
     """The request for a query: the examples first, then the query with its context line."""
     return [
         {"role": "system", "content": _SYSTEM},
-        {"role": "user", "content": _TASK.format(name=config.name, prompt=prompt)},
+        {"role": "user", "content": _task(config.name, prompt)},
         {"role": "assistant", "content": _READY},
         {"role": "user", "content": lines(context, query_line(config, query))},
     ]
+
+
+@functools.lru_cache(maxsize=64)
+def _task(name: str, prompt: str) -> str:
+    """The first message; one object for all questions, because traces keep their messages."""
+    return _TASK.format(name=name, prompt=prompt)
 
 
 def repair_messages(
