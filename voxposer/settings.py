@@ -20,6 +20,7 @@ from vecenv.errors import InvalidInput
 from vecenv.util import configs
 from voxposer.agent import AgentConfig
 from voxposer.language.llm import Llm, LlmConfig
+from voxposer.language.lmp_config import CONFIGS
 from voxposer.language.prompts import load_prompts
 from voxposer.language.saved import SavedReplies, open_llm
 
@@ -28,7 +29,9 @@ _Config = TypeVar("_Config")
 _SECRET = "api_key"
 _LLM = tuple(each.name for each in fields(LlmConfig) if each.name != _SECRET)
 # Of these, those that mean nothing to a rule base.
-_OF_MODELS = frozenset({"temperature", "seed", "timeout_s", "attempts", "api_base", "options", "concurrency"})
+_OF_MODELS = frozenset({"seed", "timeout_s", "attempts", "api_base", "options", "concurrency"})
+# Fields of every language program that may be given for all of them at once.
+_OF_LMPS = ("temperature", "max_tokens")
 _log = logging.getLogger(__name__)
 _LEAST = {"passes": 1, "max_misses": 1, "idle_ticks": 1, "repairs": 0}
 
@@ -54,8 +57,9 @@ class Settings:
         """The settings of some options; those that are not given are at their defaults.
 
         Args:
-            options: fields of ``LlmConfig`` (but no key), ``replay``, ``prompts_dir``, and fields of ``AgentConfig``;
-                fields of the configs in it as ``perception.map_size`` or as mappings.
+            options: fields of ``LlmConfig`` (but no key), ``temperature`` and ``max_tokens`` of all language programs,
+                ``replay``, ``prompts_dir``, and fields of ``AgentConfig``; fields of the configs in it as
+                ``perception.map_size`` or as mappings.
 
         Raises:
             InvalidInput: there is no such option, a value cannot be used, or a folder does not hold what it should.
@@ -68,6 +72,10 @@ class Settings:
             )
         _check_names(given)
         of_llm = {name: given.pop(name) for name in _LLM if name in given}
+        of_lmps = {name: given.pop(name) for name in _OF_LMPS if name in given}
+        if of_lmps:
+            apply(CONFIGS["planner"], of_lmps)  # so that what is wrong with it is said once, without a program's name
+            given["lmps"] = _below(dict.fromkeys(CONFIGS, of_lmps), given.get("lmps", {}))
         replay = _folder("replay", given.pop("replay", None))
         prompts_dir = _folder("prompts_dir", given.pop("prompts_dir", None))
         if replay is not None and "model" not in of_llm:
@@ -81,7 +89,7 @@ class Settings:
             agent=given,
         )
         settings.agent_config()
-        if settings.llm.is_rule_base and (vain := sorted(_OF_MODELS & set(of_llm))):
+        if settings.llm.is_rule_base and (vain := sorted({*_OF_MODELS & set(of_llm), *of_lmps} - {"max_tokens"})):
             _log.warning("%s: no effect, %s is a rule base and no language model", ", ".join(vain), settings.llm.model)
         _check_prompts(settings.prompts_dir)
         return settings
@@ -153,9 +161,16 @@ def _is_required(field: Field[Any]) -> bool:
     return field.default is MISSING and field.default_factory is MISSING
 
 
+def _below(usual: Any, given: Any) -> Any:
+    """What was given, nested mappings filled up with what is usual."""
+    if not (isinstance(usual, Mapping) and isinstance(given, Mapping)):
+        return given
+    return {**usual, **{name: _below(usual.get(name), value) for name, value in given.items()}}
+
+
 def option_names() -> list[str]:
     """Every option, nested ones with dots."""
-    return [*_LLM, "replay", "prompts_dir", *_names_in(AgentConfig())]
+    return [*_LLM, *_OF_LMPS, "replay", "prompts_dir", *_names_in(AgentConfig())]
 
 
 def _names_in(config: Any, before: str = "") -> Iterator[str]:

@@ -243,6 +243,9 @@ def test_a_rule_base_has_neither_tokens_nor_a_price(tmp_path: Path) -> None:
         ({"planner.max_steps": "many"}, "max_steps"),
         ({"perception.map_size": 3}, "map_size must be at least 50, not 3"),
         ({"passes": 0}, "passes=0: expected at least 1"),
+        ({"temperature": -1}, "temperature=-1: .* temperature not below 0"),
+        ({"lmps.planner.max_tokens": 0}, "lmps.planner.max_tokens=0: planner: max_tokens must be at least 1"),
+        ({"lmps": 3}, "lmps=3: give its fields"),
         ({"api_key": "x"}, "set the provider's environment variable"),
         ({"model": "offline/other"}, "there is no model 'offline/other'; the rule base is offline/libero"),
         ({"replay": "no_such_folder"}, "replay='no_such_folder': there is no such folder"),
@@ -291,16 +294,18 @@ def test_options_come_from_a_yaml_file_too(server: LlmServer, tmp_path: Path) ->
         "  planner:\n    max_steps: 50\n  perception.map_size: 60\n"
     )
     policy: Any = make_policy("voxposer", **EvalConfig.load(file).policy_args)
-    assert policy.settings.llm.temperature == 0.3
     config = policy.settings.agent_config()
+    assert {lmp.temperature for lmp in config.lmps.values()} == {0.3}
     assert (config.planner.max_steps, config.perception.map_size) == (50, 60)
 
 
-def test_a_reply_reaches_the_provider_with_the_options(server: LlmServer, tmp_path: Path) -> None:
-    Writer(server, {"do thing 0": code("pass")})
-    run(tmp_path / "run", options(server, temperature=0.3, max_tokens=77, seed=5), tasks="0", episodes="1")
-    (request,) = server.requests
-    assert (request["temperature"], request["max_tokens"], request["seed"]) == (0.3, 77, 5)
+def test_options_reach_the_provider(server: LlmServer, tmp_path: Path) -> None:
+    given = options(server, temperature=0.3, max_tokens=77, seed=5, **{"lmps.planner.max_tokens": 99})
+    Writer(server, {"lift up": code("pass")})
+    run(tmp_path / "run", given, tasks="0", episodes="1")
+    plan, subtask = server.requests[:2]
+    assert (plan["temperature"], plan["max_tokens"], plan["seed"]) == (0.3, 99, 5)
+    assert (subtask["temperature"], subtask["max_tokens"], subtask["seed"]) == (0.3, 77, 5)
 
 
 def test_the_same_run_with_other_options_is_another_evaluation(server: LlmServer, tmp_path: Path) -> None:

@@ -195,14 +195,6 @@ def test_tokens_and_price_that_nobody_says_are_unknown_and_not_zero(server: LlmS
     assert (model.usage.calls, model.usage.uncounted, model.usage.unpriced) == (1, 1, 1)
 
 
-def test_temperature_length_and_seed_of_the_config_go_before_those_of_the_question(
-    server: LlmServer, config: LlmConfig
-) -> None:
-    Model(replace(config, temperature=0.7, max_tokens=33, seed=5)).complete(QUESTION, max_tokens=9, temperature=0.1)
-    (request,) = server.requests
-    assert (request["temperature"], request["max_tokens"], request["seed"]) == (0.7, 33, 5)
-
-
 def test_the_same_question_of_several_threads_is_asked_once(server: LlmServer, config: LlmConfig) -> None:
     everyone_waits = threading.Event()
 

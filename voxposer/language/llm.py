@@ -57,8 +57,6 @@ class LlmConfig:
 
     Attributes:
         model: litellm's name of it, such as ``gpt-4o`` or ``openai/local``; ``offline/libero`` is rule-based and local.
-        temperature: of its answers; by default what each language program asks for, which is 0.
-        max_tokens: length of an answer at most; by default what each language program asks for, which is 512.
         seed: of its answers, for providers that take one.
         timeout_s: seconds for one attempt.
         attempts: how often a question is asked before giving up; the offline writer is asked once.
@@ -72,8 +70,6 @@ class LlmConfig:
     """
 
     model: str = OFFLINE_MODEL
-    temperature: float | None = None
-    max_tokens: int | None = None
     seed: int | None = None
     timeout_s: float = 60.0
     attempts: int = 6
@@ -92,10 +88,8 @@ class LlmConfig:
             raise ValueError(f"there is no model {self.model!r}; the rule base is {OFFLINE_MODEL}")
         if self.attempts < 1 or self.timeout_s <= 0 or self.backoff_s < 0 or self.backoff_max_s < 0:
             raise ValueError("attempts must be at least 1, timeout_s above 0, backoff_s and backoff_max_s not below 0")
-        if self.concurrency < 1 or (self.max_tokens is not None and self.max_tokens < 1):
-            raise ValueError("concurrency and max_tokens must be at least 1")
-        if self.temperature is not None and not self.temperature >= 0:
-            raise ValueError(f"temperature={self.temperature} must not be below 0")
+        if self.concurrency < 1:
+            raise ValueError(f"concurrency must be at least 1, not {self.concurrency}")
         if reserved := sorted(_RESERVED.intersection(self.options)):
             raise ValueError(f"options cannot hold {', '.join(reserved)}: a setting of its own decides it")
 
@@ -103,6 +97,17 @@ class LlmConfig:
     def is_rule_base(self) -> bool:
         """Whether programs are written by rules, so that there are neither tokens nor a price."""
         return self.model.startswith(OFFLINE)
+
+    def settings(self, max_tokens: int, temperature: float) -> dict[str, Any]:
+        """What a question is asked with besides its messages and stop tokens, ready for JSON; without the key."""
+        seed = {} if self.seed is None else {"seed": self.seed}
+        return {
+            "model": self.model,
+            "api_base": self.api_base,
+            "max_tokens": max_tokens,
+            "temperature": temperature,
+            "options": {**self.options, **seed},
+        }
 
 
 class Llm:
@@ -153,8 +158,8 @@ class Llm:
         Args:
             messages: ``role`` and ``content`` each.
             stop: the answer ends before the first of these; they also go to the provider where it takes them.
-            max_tokens: length of the answer at most, unless the config has another.
-            temperature: 0 for the likeliest answer, unless the config has another.
+            max_tokens: length of the answer at most.
+            temperature: 0 for the likeliest answer.
             note: called with the answer before it is checked.
             check: called with the text of a new answer; if it raises, so does this, and the answer is not kept.
 
@@ -179,24 +184,12 @@ class Llm:
             return look(self._of_other(other))
         return self._first(key, request, mine, look)
 
-    def settings(self, max_tokens: int = 512, temperature: float = 0.0) -> dict[str, Any]:
-        """What a question is asked with besides its messages and stop tokens, ready for JSON; without the key."""
-        config = self.config
-        seed = {} if config.seed is None else {"seed": config.seed}
-        return {
-            "model": config.model,
-            "api_base": config.api_base,
-            "max_tokens": max_tokens if config.max_tokens is None else config.max_tokens,
-            "temperature": temperature if config.temperature is None else config.temperature,
-            "options": {**config.options, **seed},
-        }
-
     def _request(
         self, messages: Sequence[Message], stop: Sequence[str], max_tokens: int, temperature: float
     ) -> dict[str, Any]:
         """Everything that decides the answer, ready for JSON."""
         said = {"messages": [dict(message) for message in messages], "stop": list(stop)}
-        return {"format": FORMAT, **said, **self.settings(max_tokens, temperature)}
+        return {"format": FORMAT, **said, **self.config.settings(max_tokens, temperature)}
 
     # What is kept
 

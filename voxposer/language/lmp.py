@@ -244,7 +244,7 @@ class Lmps:
             repair=repair,
             messages=messages,
             stop=config.stop,
-            settings=self._llm.settings(config.max_tokens, config.temperature),
+            settings=self._llm.config.settings(config.max_tokens, config.temperature),
         )
         self.trace.append(call)
         return call

@@ -63,6 +63,10 @@ class LmpConfig:
     has_return: bool = True
     return_val_name: str = "ret_val"
 
+    def __post_init__(self) -> None:
+        if self.max_tokens < 1 or not self.temperature >= 0:
+            raise ValueError(f"{self.name}: max_tokens must be at least 1 and temperature not below 0")
+
 
 CONFIGS: Mapping[str, LmpConfig] = MappingProxyType(
     {
@@ -98,7 +102,7 @@ class Call:
         repair: 0 for the question itself, 1 for the first question that shows the model what its program did wrong.
         messages: the conversation that was sent.
         stop: the tokens that the answer was to end at.
-        settings: what else the question was asked with (``voxposer.language.llm.Llm.settings``).
+        settings: what else the question was asked with (``voxposer.language.llm.LlmConfig.settings``).
         reply: the answer as it came, None if there was none.
         finish_reason: why the answer ended, as the provider names it.
         code: the answer without fences; empty if there was none.

@@ -93,7 +93,7 @@ class Failing(Protocol):
     It ends such an episode with ``env.end_episodes``.
     """
 
-    def error(self, slot: int) -> str:
+    def episode_error(self, slot: int) -> str:
         """Why the episode in a slot, which has just finished, has no verdict; "" when it has one.
 
         The episode is recorded as an error with this cause, not as a failure, and runs again.
@@ -154,7 +154,7 @@ def extras_of(policy: Policy, slot: int) -> dict[str, Any]:
 
 def error_of(policy: Policy, slot: int) -> str:
     """Why the episode in a slot has no verdict; "" when it has one."""
-    return policy.error(slot) if isinstance(policy, Failing) else ""
+    return policy.episode_error(slot) if isinstance(policy, Failing) else ""
 
 
 def make_policy(name: str, given: Mapping[str, Any] | None = None, /, *, seed: int = 0, **arguments: Any) -> Policy:

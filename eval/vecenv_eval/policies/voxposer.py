@@ -5,8 +5,8 @@ to the language model and their cost, and why a failed one failed. A slot whose 
 the agent's next round, while the others are between subtasks of theirs. The model is ``offline/libero`` unless another
 is named: a rule-based writer of programs, no language model at all. The policy's name says which it was.
 
-An episode whose model could not be asked has no verdict (:meth:`VoxPoserPolicy.error`); a model that can be asked in no
-episode ends the run (``PolicyUnavailable``). Every question and reply of an episode is its log, from which
+An episode whose model could not be asked has no verdict (:meth:`VoxPoserPolicy.episode_error`); a model that can be
+asked in no episode ends the run (``PolicyUnavailable``). Every question and reply of an episode is its log, from which
 ``replay=FOLDER`` answers without the model.
 """
 
@@ -97,7 +97,7 @@ class VoxPoserPolicy:
         except LlmError as error:
             raise PolicyUnavailable(str(error)) from error
 
-    def error(self, slot: int) -> str:
+    def episode_error(self, slot: int) -> str:
         """Why the episode in a slot has no verdict: the model could not be asked; "" if it could."""
         return self.agent.error(slot) if self.agent is not None else ""
 
