@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from support.llm_server import Answer, LlmServer, code, serving
+from support.lmps import QUESTION, Model
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
 
@@ -25,8 +26,6 @@ from voxposer.language.reply_cache import ReplyCache
 
 # Of a library that litellm uses.
 pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
-QUESTION = ({"role": "user", "content": "# Query: grasp the bowl."},)
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +51,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def config(server: LlmServer, folder: Path) -> LlmConfig:
     return LlmConfig(model="openai/local", api_base=server.base, api_key="secret", timeout_s=5, attempts=4, backoff_s=2)
-
-
-class Model(Llm):
-    """A model that notes its pauses in place of waiting."""
-
-    def __init__(self, config: LlmConfig) -> None:
-        self.pauses: list[float] = []
-        super().__init__(config, sleep=self.pauses.append)
 
 
 # The question and the answer

@@ -14,10 +14,9 @@ from typing import Any
 
 import pytest
 from support.llm_server import HANG, Answer, LlmServer, code, failure, serving
+from support.lmps import QUESTION, Model
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
-
-from test_llm import QUESTION, Model
 
 from vecenv.util import caching
 from voxposer.language.llm import Llm, LlmConfig
