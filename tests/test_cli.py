@@ -291,7 +291,7 @@ def test_on_a_terminal_progress_is_one_bar_over_the_episodes() -> None:
     text = shown([leg("libero_goal")], [(0, progress(setting_up=True)), (0, progress(8, 2, ended=10))])
     assert "libero_goal" in text
     assert "10/20" in text
-    assert "stream 2/2: 3 solved, 1 faulted, 2 failed" in text
+    assert "stream 2/2: 3 solved, 1 faulted, 2 in error" in text
     assert "300 steps/s" in text
     assert "37.5% success" in text
     assert "all" not in text

@@ -4,7 +4,9 @@ An environment that speaks ``vecenv.contract`` and an :class:`~voxposer.language
 (:meth:`Agent.step`) every slot that has a subtask left plans it on one frozen snapshot: the composer's program asks for
 motions, the planner turns the value maps of all slots into paths in one call, and one ``env.step_waypoints`` executes
 all plans. Objects that are to be moved without a grasp are pushed, one push a round. A slot whose program fails, or for
-which there is no path, is stopped with its cause (``voxposer.slots``) and holds still; the other slots continue.
+which there is no path, is stopped with its cause (``voxposer.slots``) and holds still; the other slots continue. A slot
+whose questions the model does not answer ends at once, without a verdict (:meth:`Agent.error`). The programs of a round
+are written and run side by side, so that slots wait for a model together.
 
 Nothing that a slot does depends on the others: in a round it executes its own plan and no tick more, so a slot may
 begin another episode (:meth:`Agent.begin`) while the others are anywhere in theirs.
@@ -12,8 +14,10 @@ begin another episode (:meth:`Agent.begin`) while the others are anywhere in the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -25,6 +29,8 @@ from voxposer import pushing
 from voxposer.interface import Interface
 from voxposer.language.llm import Llm
 from voxposer.language.lmp import build_lmps
+from voxposer.language.lmp_config import CONFIGS, Call, LmpConfig
+from voxposer.language.replies import LlmError
 from voxposer.paths import plan_paths
 from voxposer.perception.config import HandState, PerceptionConfig
 from voxposer.perception.observation import PerceptionError
@@ -35,9 +41,10 @@ from voxposer.planning.plan import PlanConfig, PlannedWaypoint, SubtaskPlan
 from voxposer.pushing import PushError, PushingConfig, PushSituation, PushTask
 from voxposer.quaternions import quaternion
 from voxposer.requests import InterfaceError, MotionRequest
-from voxposer.sandbox.guard import HostFault
-from voxposer.slots import Grasp, Moving, Pushing, Ready, Slot, pending
+from voxposer.sandbox.guard import HostFault, Limits
+from voxposer.slots import FOLLOWED, Grasp, Moving, Pushing, Ready, Slot, pending
 from voxposer.stops import stops_of, travel
+from voxposer.turns import Turns, TurnsOver
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +57,9 @@ class AgentConfig:
         plan: how stops become waypoints.
         planner: of paths over voxels.
         push: how objects are pushed.
+        limits: what a program may use.
+        lmps: the language programs, by name.
+        repairs: how often the model is shown what a program of its did wrong, and asked for another; 0 for never.
         passes: how often the whole instruction is planned when it was executed to the end without success.
         max_misses: a plan is abandoned after this many waypoints in a row that could not be reached.
         idle_ticks: ticks that stopped slots wait in a round in which no slot has a plan.
@@ -60,6 +70,9 @@ class AgentConfig:
     plan: PlanConfig = field(default_factory=PlanConfig)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     push: PushingConfig = field(default_factory=PushingConfig)
+    limits: Limits = field(default_factory=Limits)
+    lmps: Mapping[str, LmpConfig] = field(default_factory=lambda: CONFIGS)
+    repairs: int = 1
     passes: int = 3
     max_misses: int = 2
     idle_ticks: int = 50
@@ -98,6 +111,7 @@ class Agent:
         config: options.
         prompts_dir: folder of prompts to use in place of the package's own.
         on_planned: called with every motion as it is planned.
+        episodes: name of the episode in each slot, by which saved replies are found; may be empty.
 
     Attributes:
         slots: the state of each slot.
@@ -112,32 +126,44 @@ class Agent:
         config: AgentConfig = AgentConfig(),
         prompts_dir: str | None = None,
         on_planned: Callable[[PlannedMotion], None] | None = None,
+        episodes: Sequence[str] = (),
     ) -> None:
         self.env, self.config, self._on_planned = env, config, on_planned
         self._llm, self._prompts_dir = llm, prompts_dir
+        self._turns = Turns(1 if llm.config.is_rule_base else llm.config.concurrency)
         self._finished, self.succeeded = np.zeros(env.num_envs, bool), np.zeros(env.num_envs, bool)
         snapshots = env.observe_objects().snapshot
-        self.slots = [self._slot(*pair) for pair in zip(instructions, snapshots, strict=True)]
+        names = episodes or ("",) * env.num_envs
+        self.slots = [self._slot(*each) for each in zip(instructions, snapshots, names, strict=True)]
 
-    def begin(self, instructions: Sequence[str], slots: Sequence[int]) -> None:
+    @property
+    def rule_based(self) -> bool:
+        """Whether rules write the programs, and no language model."""
+        return self._llm.config.is_rule_base
+
+    def begin(self, instructions: Sequence[str], slots: Sequence[int], episodes: Sequence[str] = ()) -> None:
         """Begin other episodes in some slots, which were just reset; the others continue theirs.
 
         Args:
             instructions: of every slot of the batch, B strings.
             slots: the slots that begin.
+            episodes: name of the episode in every slot of the batch, or none.
         """
         snapshots = self.env.observe_objects(slots=slots).snapshot
         for i in slots:
             _release(self.slots[i])
-            self.slots[i] = self._slot(instructions[i], snapshots[i])
+            self.slots[i] = self._slot(instructions[i], snapshots[i], episodes[i] if episodes else "")
             self._finished[i] = self.succeeded[i] = False
 
     def step(self) -> Control:
-        """One round: plan a subtask in every slot that has one left, and execute the plans; stopped slots wait."""
+        """One round: plan a subtask in every slot that has one left, and execute the plans; stopped slots wait.
+
+        Raises:
+            LlmError: the model can be asked in no slot, whatever is tried (``permanent``).
+        """
         live = [i for i, slot in enumerate(self.slots) if not self._finished[i] and not slot.cause]
         snapshots = self.env.observe_objects(slots=live).snapshot
-        for i in live:
-            self._run_programs(self.slots[i], snapshots[i])
+        self._run_all_programs(live, snapshots)
         waypoints = self._plan(live)
         if not any(waypoints):
             return self._record(self._wait())
@@ -149,14 +175,37 @@ class Agent:
         for slot in self.slots:
             _release(slot)
 
-    def _slot(self, instruction: str, snapshot: ObjectsSnapshot | None) -> Slot:
+    def error(self, index: int) -> str:
+        """Why the episode in a slot ends without a verdict: the model could not be asked; "" if it could."""
+        return self.slots[index].error
+
+    def _slot(self, instruction: str, snapshot: ObjectsSnapshot | None, episode: str = "") -> Slot:
         """A slot whose episode has just begun."""
         interface = Interface()
         home = np.zeros(7) if snapshot is None else snapshot.ee_pose.copy()
-        lmps = build_lmps(interface.functions(), self._llm, self._prompts_dir)
+        lmps = build_lmps(
+            interface.functions(),
+            self._llm.for_episode(episode),
+            self._prompts_dir,
+            self.config.limits,
+            self.config.lmps,
+            repairs=self.config.repairs,
+            undo=interface.restart,
+            aside=self._turns.aside,
+        )
         return Slot(instruction, lmps, interface, home)
 
     # -- one slot's subtask --------------------------------------------------------------------------------------------
+
+    def _run_all_programs(self, live: Sequence[int], snapshots: Sequence[ObjectsSnapshot | None]) -> None:
+        """Run the programs of every live slot; those whose questions were not answered end their episodes."""
+        asked = {i: len(self.slots[i].lmps.trace) for i in live}
+        self._turns.run([partial(self._run_programs, self.slots[i], snapshots[i]) for i in live])
+        if not self.rule_based:
+            _settle([call for i in live for call in self.slots[i].lmps.trace[asked[i] :]])
+        unanswered = [i for i in live if self.slots[i].error]
+        if unanswered:
+            self.env.end_episodes(unanswered)
 
     def _run_programs(self, slot: Slot, snapshot: ObjectsSnapshot | None) -> None:
         """Run the programs of the next subtasks until one asks for a motion."""
@@ -174,6 +223,12 @@ class Agent:
                 requests = tuple(slot.interface.taken())
                 if requests:
                     slot.enter(Moving(requests))
+        except LlmError as error:
+            if error.permanent:
+                raise
+            slot.give_up(_described(error))
+        except TurnsOver:
+            raise
         except (HostFault, PerceptionError, InterfaceError) as error:
             _stop_with(slot, error)
 
@@ -198,7 +253,7 @@ class Agent:
         if slot.progress.has_next:
             return True
         if slot.progress.passes >= self.config.passes:
-            slot.stop("followed to the end without success")
+            slot.stop(FOLLOWED)
             return False
         slot.progress = replace(slot.progress, passes=slot.progress.passes + 1)
         slot.lmps.set_context(perception.names)
@@ -329,7 +384,27 @@ def _release(slot: Slot) -> None:
 
 
 def _stop_with(slot: Slot, error: Exception) -> None:
-    slot.stop(f"{type(error).__name__}: {error}")
+    slot.stop(_described(error))
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _settle(calls: Sequence[Call]) -> None:
+    """Let the first of the equal questions of a round be the one that was paid, whichever happened to be asked first.
+
+    Args:
+        calls: the questions of all slots, slot by slot.
+    """
+    equal: dict[str, list[Call]] = {}
+    for call in calls:
+        if call.reply is not None:
+            equal.setdefault(json.dumps([*map(dict, call.messages)]), []).append(call)
+    for same in equal.values():
+        paid = sum(not call.cached for call in same)
+        for number, call in enumerate(same):
+            call.cached = number >= paid
 
 
 def _remember_grasp(slot: Slot, request: MotionRequest, end: np.ndarray) -> None:

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import typer
 
-voxposer_app = typer.Typer(help="The VoxPoser planner.", no_args_is_help=True)
+voxposer_app = typer.Typer(
+    help="The VoxPoser planner. Its programs are written by a rule base, not by a language model, unless one is named.",
+    no_args_is_help=True,
+)
 
 
 @voxposer_app.callback()
@@ -17,7 +20,10 @@ def _group() -> None:
 @voxposer_app.command("show")
 def show_command(
     task: str = typer.Argument(..., help="SUITE/TASK or SUITE/TASK/EPISODE, such as libero_goal/0."),
-    model: str = typer.Option("offline/libero", help="litellm's name of the model that writes the programs."),
+    model: str = typer.Option(
+        "offline/libero",
+        help="litellm's name of the model that writes the programs; the default is a rule base, no language model.",
+    ),
     out: Path = typer.Option(Path("voxposer_show"), help="Folder to write to."),
     prompts_dir: Path | None = typer.Option(None, help="Folder of prompts to use.", show_default="the package's"),
 ) -> None:

@@ -44,6 +44,13 @@ class Interface:
         self._perception, self._closed = perception, perception.hand.closed
         self.requests = []
 
+    def restart(self) -> None:
+        """Forget what was asked for since the snapshot came: the program that asked is replaced."""
+        ee = self.perception.snapshot.ee_pose
+        self.perception.move_hand(ee[:3], matrix(ee[3:]), closed=self.perception.hand.closed)
+        self._closed = self.perception.hand.closed
+        self.requests = []
+
     def taken(self) -> list[MotionRequest]:
         """The motions asked for since the last call; their maps, which are large, are released here."""
         requests, self.requests = self.requests, []

@@ -133,7 +133,7 @@ def render_page(shown: EpisodeRecord) -> str:
 <span class="bad">{html.escape(shown.cause)}</span></p>
 <h2>Subtasks</h2><ol>{subtasks}</ol>
 <h2>Motions</h2><p class="note">Drag to turn, scroll to zoom, click names to hide them. Metres.</p>{motions}
-<h2>Programs</h2><p class="note">{_totals(shown.calls)}</p>{calls}
+<h2>Programs</h2><p class="note">{_totals(shown.calls, shown.model)}</p>{calls}
 </body></html>
 """
 
@@ -142,21 +142,27 @@ def _author(model: str) -> str:
     return f"{model} (rule-based, no language model)" if model.startswith("offline/") else model
 
 
-def _totals(calls: Sequence[Call]) -> str:
-    cost = sum(call.cost_usd or 0.0 for call in calls if not call.cached)
-    return (
-        f"{len(calls)} questions, {sum(call.cached for call in calls)} answered from the cache, {cost:.4f} US dollars"
-    )
+def _totals(calls: Sequence[Call], model: str) -> str:
+    """Questions and, of a language model, what they cost as far as that is known."""
+    asked = f"{len(calls)} questions, {sum(call.cached for call in calls)} answered from the cache"
+    if LlmConfig(model=model).is_rule_base:
+        return asked
+    prices = [call.cost_usd for call in calls if not call.cached]
+    known = [price for price in prices if price is not None]
+    unknown = f", the price of {len(prices) - len(known)} unknown" if len(known) < len(prices) else ""
+    return f"{asked}, {sum(known):.4f} US dollars{unknown}" if known else f"{asked}{unknown}"
 
 
 def _call_section(call: Call) -> str:
     state = "from the cache" if call.cached else "asked"
-    tokens = f"{call.prompt_tokens} + {call.completion_tokens} tokens"
+    state = f"repair, {state}" if call.repair else state
+    counted = call.prompt_tokens is not None and call.completion_tokens is not None
+    tokens = f", {call.prompt_tokens} + {call.completion_tokens} tokens" if counted else ""
     error = f'<p class="bad">{html.escape(call.error)}</p>' if call.error else ""
     context = f"{call.context}\n" if call.context else ""
     return (
         f"<details><summary><b>{html.escape(call.lmp)}</b>: {html.escape(call.query)} "
-        f'<span class="note">{state}, {tokens}</span></summary>{error}'
+        f'<span class="note">{state}{tokens}</span></summary>{error}'
         f"<pre>{html.escape(context)}{html.escape(call.code)}</pre></details>"
     )
 

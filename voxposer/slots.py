@@ -6,7 +6,7 @@ scene or plans; ``voxposer.agent`` decides which event happened.
 
 A slot is *ready* until the program of its next subtask asks for motions, then *moving* while some of them are not yet
 planned. A motion of an object makes it *pushing*, one push a round, until the object has arrived; the other motions of
-the subtask wait. *Stopped* is final.
+the subtask wait. *Stopped* is final; *unanswered* is stopped because the language model could not be asked.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from voxposer.interface import Interface
 from voxposer.language.lmp import Lmps
 from voxposer.pushing import PushTask
 from voxposer.requests import MotionRequest
+
+# Why a slot stops that has done all that it was told.
+FOLLOWED = "followed to the end without success"
 
 
 @dataclass(frozen=True)
@@ -50,18 +53,24 @@ class Stopped:
     cause: str
 
 
+@dataclass(frozen=True)
+class Unanswered(Stopped):
+    """The language model could not be asked, for the reason ``cause``: the episode ends without a verdict."""
+
+
 Phase = Ready | Moving | Pushing | Stopped
 
 # Phase -> phases that may follow it.
 TRANSITIONS: Mapping[type, tuple[type, ...]] = MappingProxyType(
     {
         # A program asked for motions; or an error, no snapshot, no subtask left.
-        Ready: (Moving, Stopped),
+        Ready: (Moving, Stopped, Unanswered),
         # A motion was planned, others wait or none is left; an object is to be pushed; there is no path.
         Moving: (Moving, Ready, Pushing, Stopped),
         # The object has arrived, other motions wait or none is left; or there is no room to push it.
         Pushing: (Moving, Ready, Stopped),
         Stopped: (),
+        Unanswered: (),
     }
 )
 
@@ -173,6 +182,11 @@ class Slot:
         return self.phase.cause if isinstance(self.phase, Stopped) else ""
 
     @property
+    def error(self) -> str:
+        """Why the episode has no verdict: the language model could not be asked; "" while it could."""
+        return self.phase.cause if isinstance(self.phase, Unanswered) else ""
+
+    @property
     def requests(self) -> tuple[MotionRequest, ...]:
         """Motions that are asked for and not planned yet."""
         return self.phase.requests if isinstance(self.phase, Moving | Pushing) else ()
@@ -185,6 +199,10 @@ class Slot:
     def stop(self, cause: str) -> None:
         """Try nothing more."""
         self.enter(Stopped(cause))
+
+    def give_up(self, cause: str) -> None:
+        """End without a verdict: the language model could not be asked."""
+        self.enter(Unanswered(cause))
 
     def close_grip(self, closed: bool) -> None:
         """Record the last grip command of a plan."""

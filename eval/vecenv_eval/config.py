@@ -103,7 +103,8 @@ class EvalConfig:
     policy: str | None = field(
         default=None,
         metadata=_about(
-            "random, zero, voxposer, pick_place (LIBERO), simpler_scripted, or your own module:Class.",
+            "random, zero, voxposer (programs by a rule base, or by --policy-arg model=...), pick_place (LIBERO), "
+            "simpler_scripted, or your own module:Class.",
             default="the suite's scripted one",
         ),
     )
@@ -112,7 +113,8 @@ class EvalConfig:
         default=ALL, metadata=_about("all (the protocol's), a count, or indices and ranges: 0,3,5-7.")
     )
     policy_args: Mapping[str, Any] = field(
-        default_factory=dict, metadata=_about("key=value for the policy; repeatable.", flag="policy-arg")
+        default_factory=dict,
+        metadata=_about("key=value for the policy, a.b=value for a nested one; repeatable.", flag="policy-arg"),
     )
     protocol: str = field(default="seed", metadata=_about("Evaluation protocol; `vecenv list --protocols` has them."))
     backend: str = field(default="native", metadata=_about("Physics backend."))

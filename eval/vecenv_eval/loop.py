@@ -5,6 +5,8 @@ that follow as slots end. A policy that can begin single slots (``vecenv_eval.po
 episode of a scene in a slot as soon as the one before has ended; any other policy gets batches, one after the other.
 
 An exception costs the episodes that were running: they are written as errors with the cause, and the others still run.
+A policy that could not act in one episode (``vecenv_eval.policies.Failing``) costs that episode; one that can act in
+none (``PolicyUnavailable``) ends the run.
 """
 
 from __future__ import annotations
@@ -24,12 +26,12 @@ from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.drive import drive
 from vecenv_eval.environments import Environments, Placed, slots_of
 from vecenv_eval.episodes import Episode, Stream, Suite, plan, streams
-from vecenv_eval.policies import Ending, Policy, Refillable, extras_of
+from vecenv_eval.policies import Ending, Logging, Policy, PolicyUnavailable, Refillable, error_of, extras_of
 from vecenv_eval.recorders import make_recorders
 from vecenv_eval.results import Progress, count
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.sink import Sink
-from vecenv_eval.store import Record, StoreError
+from vecenv_eval.store import Record, StoreError, write_log
 from vecenv_eval.watch import watching
 
 # On a GPU a reset of a few slots costs as much as of all: slots wait until this share of them can begin together.
@@ -98,14 +100,15 @@ class EpisodeLoop:
         self._progress = _ProgressReports(on_progress, len(wanted), self._records)
         self._environments = Environments(simulator, suite, config, self._write_conditions)
         self._recorders = make_recorders(config, suite, simulator, store)
-        self._number = self._failures = self._verdicts = 0
+        self._number = self._failures = self._verdicts = self._errors_in_a_row = 0
         self._refill_share = _SHARE_TO_REFILL.get(config.backend, _GPU_SHARE)
 
     def run(self, streams: Sequence[Stream], plan: Callable[[Collection[Episode]], Sequence[Stream]]) -> bool:
         """Run every stream; True when stopped from the keyboard.
 
         Episodes that end in an error run again, as often as the config says. When two streams have failed and no
-        episode of this run has a verdict, the rest is not tried.
+        episode of this run has a verdict, the rest is not tried; nor is it when the policy is unavailable, or could not
+        act in twice as many episodes in a row as there are slots.
 
         Args:
             streams: what to run.
@@ -122,6 +125,8 @@ class EpisodeLoop:
                 queue = deque(plan(self._failed))
         except KeyboardInterrupt:
             return True
+        except PolicyUnavailable:  # the running episodes have it as their error
+            return False
         finally:
             self._progress.report_rest()
             self.close()
@@ -138,6 +143,7 @@ class EpisodeLoop:
 
         Raises:
             ConfigError: the environment refuses a setting.
+            PolicyUnavailable: the policy can act in no episode.
         """
         rest: Stream | None = stream
         while rest is not None and len(rest):
@@ -187,6 +193,11 @@ class EpisodeLoop:
                 self._run_placed(number, running)
         except StoreError:
             raise  # what cannot be stored need not run
+        except PolicyUnavailable as error:
+            left = [slot for slot, episode in enumerate(running.slots) if episode not in running.ended]
+            self._write_logs(running, left)
+            self._write_error(number, [running.slots[slot] for slot in left], str(error), traceback.format_exc())
+            raise
         except Exception as error:  # whatever a policy or a simulator raises concerns the running episodes only
             self._write_errors(number, running.slots, error)
             self._environments.close()
@@ -216,14 +227,20 @@ class EpisodeLoop:
         for control, finished in drive(env, self._policy, refill if refillable else None):
             clocks.tick(control)
             if finished.any():
-                metrics, slots = env.evaluate(), np.flatnonzero(finished).tolist()
+                metrics = env.evaluate()
                 ended += int(metrics.num_steps[finished].sum())
+                errors = {slot: error_of(self._policy, slot) for slot in np.flatnonzero(finished).tolist()}
+                slots = [slot for slot, error in errors.items() if not error]
+                running.ended |= {running.slots[slot] for slot in errors}
                 records = {slot: self._record(number, running, slot, metrics, control, clocks) for slot in slots}
                 for recorder in self._recorders:
                     recorder.finish(env, records)
+                self._write_logs(running, list(errors))
                 self._write(list(records.values()))
                 self._verdicts += len(slots)
                 self._tell_policy(running, slots)
+                self._errors_in_a_row = 0 if slots else self._errors_in_a_row
+                self._note_errors(number, running, {slot: error for slot, error in errors.items() if error})
             progress.steps, progress.seconds = (
                 before[0] + ended + int(control.step_index[~control.done].sum()),
                 before[1] + clocks.now(),
@@ -233,6 +250,26 @@ class EpisodeLoop:
     def _begin_recording(self, running: _Running, slots: Iterable[int]) -> None:
         for recorder in self._recorders:
             recorder.begin(running.placed.env, {slot: running.slots[slot] for slot in slots})
+
+    def _note_errors(self, number: int, running: _Running, errors: Mapping[int, str]) -> None:
+        """Record episodes in which the policy could not act.
+
+        Raises:
+            PolicyUnavailable: there are too many in a row, or the config says to stop at the first.
+        """
+        for cause in dict.fromkeys(errors.values()):
+            self._write_error(number, [running.slots[slot] for slot in errors if errors[slot] == cause], cause, cause)
+        self._errors_in_a_row += len(errors)
+        most = 1 if self._config.fail_fast else 2 * len(running.slots)
+        if errors and self._errors_in_a_row >= most:
+            count = f"{self._errors_in_a_row} episodes in a row ended in an error"
+            raise PolicyUnavailable(f"the run was ended: {count}, the last with {list(errors.values())[-1]}")
+
+    def _write_logs(self, running: _Running, slots: Iterable[int]) -> None:
+        """Store what the policy notes about episodes; on the disk before their records are."""
+        if isinstance(self._policy, Logging):
+            for slot in slots:
+                write_log(self._store.folder, running.slots[slot], self._policy.episode_log(slot))
 
     def _tell_policy(self, running: _Running, slots: Sequence[int]) -> None:
         if isinstance(self._policy, Ending):
@@ -270,9 +307,14 @@ class EpisodeLoop:
         )
 
     def _write_errors(self, number: int, episodes: Sequence[Episode], error: Exception) -> None:
+        """Record an exception as the error of the episodes that it cost."""
         cause = f"{type(error).__name__}: {error}".splitlines()[0]
+        self._write_error(number, episodes, cause, traceback.format_exc())
+
+    def _write_error(self, number: int, episodes: Sequence[Episode], cause: str, details: str) -> None:
+        """Record an error of episodes; those that have a verdict keep it."""
         self.causes[cause] = None
-        self._store.log_error(f"run {self._index} stream {number} ({len(episodes)} episodes)\n{traceback.format_exc()}")
+        self._store.log_error(f"run {self._index} stream {number} ({len(episodes)} episodes)\n{details}")
         failed = [
             Record.of_error(episode, self._suite.instructions[episode.task], cause, run=self._index, batch=number)
             for episode in episodes
@@ -298,9 +340,11 @@ class _Running:
         placed: the environment and its first episodes.
         slots: the episode in each slot.
         info: what the last reset returned.
+        ended: the episodes that have ended.
     """
 
     def __init__(self, suite: Suite, placed: Placed, stream: Stream) -> None:
+        self.ended: set[Episode] = set()
         self.placed, self.slots, self.info = placed, list(placed.slots), placed.info
         self._suite = suite
         self._waiting: dict[Hashable, deque[Episode]] = {scene: deque(e) for scene, e in stream.waiting.items()}

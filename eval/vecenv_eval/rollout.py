@@ -17,7 +17,7 @@ from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.drive import drive
 from vecenv_eval.environments import Environments
 from vecenv_eval.episodes import Stream
-from vecenv_eval.policies import Closing, Policy
+from vecenv_eval.policies import Closing, Policy, PolicyUnavailable, error_of
 from vecenv_eval.runner import Evaluation, check_cameras
 from vecenv_eval.video.writer import Recordable, recording
 
@@ -43,6 +43,7 @@ def record_config(config: EvalConfig, out: Path) -> tuple[int, int, int]:
         ConfigError, SpecError, PolicyError: something in the config does not exist or does not fit.
         GlError, RenderError: images cannot be rendered or written.
         PolicyStuck: the policy takes no steps.
+        PolicyUnavailable: it could not act in some of the episodes; the video is there.
     """
     everywhere = replace(config, cameras=None)
     evaluation = Evaluation(everywhere)
@@ -59,6 +60,8 @@ def record_config(config: EvalConfig, out: Path) -> tuple[int, int, int]:
             env = environments.place(Stream(evaluation.suite.name, planned)).env
             cameras = config.camera_names or ("agentview",)
             frames = record_rollout(cast("RecordableEnv", env), evaluation.policy, out, cameras)
+            if errors := [text for slot in range(len(planned)) if (text := error_of(evaluation.policy, slot))]:
+                raise PolicyUnavailable(f"{len(errors)} of {len(planned)} episodes have no verdict: {errors[0]}")
             return frames, int(env.evaluate().success.sum()), len(planned)
         finally:
             environments.close()

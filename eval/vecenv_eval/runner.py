@@ -92,7 +92,7 @@ class Evaluation:
         Raises:
             ConfigError: it reads a camera that it would not get.
         """
-        policy = make_policy(self.config.policy_name, seed=self.policy_seed, **self.config.policy_args)
+        policy = make_policy(self.config.policy_name, self.config.policy_args, seed=self.policy_seed)
         if isinstance(policy, Seeing):
             _check_cameras_of(policy, self.config, self.suite, self.tasks)
         return policy
@@ -188,7 +188,7 @@ def check(config: EvalConfig, simulator: Simulator) -> tuple[Suite, tuple[int, .
     check_cameras(config, suite, tasks)
     _check_packages(config)
     _check_policy(config)
-    check_policy(config.policy_name, **config.policy_args)
+    check_policy(config.policy_name, config.policy_args)
     make_engine(config)
     return suite, tasks, episodes
 

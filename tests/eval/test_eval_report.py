@@ -128,7 +128,8 @@ def test_the_summary_is_plain_json() -> None:
 def test_what_the_policy_reports_is_averaged_or_counted() -> None:
     said = [{"calls": 2, "cause": ""}, {"calls": 4, "cause": "dropped it"}, {"calls": None, "cause": "dropped it"}]
     found = summary(*(record(0, i, extras=extras) for i, extras in enumerate(said)))
-    assert found.extras == {"calls": 3.0, "cause": {"dropped it": 2}}
+    unknown = {"calls (unknown)": {"unknown": 1}}
+    assert found.extras == {"calls": 3.0, **unknown, "cause": {"dropped it": 2}}
     page = markdown(found)
     assert "- calls: 3" in page
     assert "- cause: 2 x dropped it" in page

@@ -20,12 +20,14 @@ class Answer:
         body: sent as it is if it is text, as JSON otherwise.
         headers: besides the content's type and length.
         hang: the connection stays open without a byte until the server closes.
+        cut: only this many bytes of the body are sent before the connection closes, None for all.
     """
 
     status: int = 200
     body: Any = ""
     headers: Mapping[str, str] = field(default_factory=dict)
     hang: bool = False
+    cut: int | None = None
 
 
 def code(text: str | None, *, finish: str = "stop", prompt_tokens: int = 11, completion_tokens: int = 7) -> Answer:
@@ -40,9 +42,9 @@ def code(text: str | None, *, finish: str = "stop", prompt_tokens: int = 11, com
     return Answer(body=body | {"usage": usage})
 
 
-def failure(status: int, message: str, **headers: str) -> Answer:
+def failure(status: int, message: str, code: str | None = None, **headers: str) -> Answer:
     """An error in OpenAI's form; underscores in header names stand for hyphens."""
-    error = {"error": {"message": message, "type": "server_error", "code": None}}
+    error = {"error": {"message": message, "type": code or "server_error", "code": code}}
     return Answer(status=status, body=error, headers={name.replace("_", "-"): value for name, value in headers.items()})
 
 
@@ -55,7 +57,8 @@ class LlmServer:
     Attributes:
         base: address for ``api_base``.
         requests: bodies of the requests so far.
-        answer: called with the body of each request.
+        answer: called with the body of each request; it may wait.
+        in_flight: requests that wait for an answer now, and the most there have been.
     """
 
     def __init__(self, base: str) -> None:
@@ -63,6 +66,20 @@ class LlmServer:
         self.requests: list[dict[str, Any]] = []
         self.answer: Callable[[dict[str, Any]], Answer] = lambda request: code("pass")
         self.closing = threading.Event()
+        self.in_flight, self.most_in_flight = 0, 0
+        self._lock = threading.Lock()
+
+    @contextlib.contextmanager
+    def counted(self) -> Iterator[None]:
+        """Inside, a request waits for its answer."""
+        with self._lock:
+            self.in_flight += 1
+            self.most_in_flight = max(self.most_in_flight, self.in_flight)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self.in_flight -= 1
 
     def say(self, *answers: Answer | str) -> None:
         """Answer the next requests with these in turn, and all later ones with the last."""
@@ -77,7 +94,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         self.llm.requests.append(request)
-        answer = self.llm.answer(request)
+        with self.llm.counted():
+            answer = self.llm.answer(request)
         if answer.hang:
             self.llm.closing.wait()
             return
@@ -87,17 +105,23 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
-        self.wfile.write(data)
+        self.wfile.write(data[: answer.cut])
+        if answer.cut is not None:
+            self.close_connection = True
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing on stderr."""
+
+
+class _Server(ThreadingHTTPServer):
+    request_queue_size = 64
 
 
 @contextlib.contextmanager
 def serving() -> Iterator[LlmServer]:
     """A server on a free port, closed afterwards."""
     handler = type("Handler", (_Handler,), {})
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as http:
+    with _Server(("127.0.0.1", 0), handler) as http:
         http.daemon_threads = True
         llm = handler.llm = LlmServer(f"http://127.0.0.1:{http.server_address[1]}/v1")
         thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)

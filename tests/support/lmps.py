@@ -19,6 +19,17 @@ OBJECTS = ("bowl_1", "plate_1", "cup_1", "cup_2")
 PROMPTS = {name: f"# Query: an example for {name}.\npass" for name in NAMES}
 
 
+QUESTION = ({"role": "user", "content": "# Query: grasp the bowl."},)
+
+
+class Model(Llm):
+    """A model that notes its pauses in place of waiting."""
+
+    def __init__(self, config: LlmConfig) -> None:
+        self.pauses: list[float] = []
+        super().__init__(config, sleep=self.pauses.append)
+
+
 class World:
     """Things at voxels, one centimetre a voxel, and what was done."""
 

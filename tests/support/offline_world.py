@@ -19,7 +19,7 @@ from vecenv.observations import ObjectsSnapshot, RegionBox
 from voxposer.language.llm import LlmConfig
 from voxposer.language.lmp import build_lmps
 from voxposer.language.observations import DynamicObservation, LazyMap, Observation
-from voxposer.language.replies import Reply, ReplyError
+from voxposer.language.replies import NoRuleError, Reply
 from voxposer.offline import provider as offline
 from voxposer.offline.names import NotUnderstood
 
@@ -36,7 +36,7 @@ class Writer:
         try:
             text, finish = _written(json.dumps(messages), tuple(stop), max_tokens)
         except NotUnderstood as error:
-            raise ReplyError(self.config.model, str(error)) from error
+            raise NoRuleError(self.config.model, str(error)) from error
         assert finish == "stop", f"more than {max_tokens} tokens: {text}"
         return Reply(text=text, model="writer", finish_reason=finish, prompt_tokens=0, completion_tokens=0, cost_usd=0)
 

@@ -71,6 +71,7 @@ class Obedient:
         self.snapshots, self.num_envs = list(snapshots), len(snapshots)
         self.ticks = np.zeros(self.num_envs, int)
         self.plans: list[Any] = []
+        self.ended = np.zeros(self.num_envs, bool)
         self._budget, self._solved_after = budget, solved_after
 
     def reset(self) -> ResetInfo:
@@ -107,11 +108,14 @@ class Obedient:
         return {
             "reward": solved.astype(float),
             "terminated": solved,
-            "truncated": ~solved & (self.ticks >= self._budget),
+            "truncated": ~solved & (self.ended | (self.ticks >= self._budget)),
             "success": solved,
             "step_index": self.ticks.copy(),
             "info": {"sanitized": solved, "fault": ("",) * self.num_envs, "ticks": self.ticks.copy()},
         }
+
+    def end_episodes(self, slots: Any) -> None:
+        self.ended[slots] = True
 
     def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> Any:
         raise NotImplementedError

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sqlite3
 import subprocess
 import sys
@@ -11,25 +10,22 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
-from email.utils import format_datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.llm_server import HANG, Answer, LlmServer, code, failure, serving
+from support.llm_server import Answer, LlmServer, code, serving
+from support.lmps import QUESTION, Model
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
 
 from vecenv.util import caching
 from voxposer.language.llm import Llm, LlmConfig
-from voxposer.language.replies import LlmError, ReplyError, Usage
+from voxposer.language.replies import ReplyError, Usage
 from voxposer.language.reply_cache import ReplyCache
 
 # Of a library that litellm uses.
 pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
-QUESTION = ({"role": "user", "content": "# Query: grasp the bowl."},)
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +51,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def config(server: LlmServer, folder: Path) -> LlmConfig:
     return LlmConfig(model="openai/local", api_base=server.base, api_key="secret", timeout_s=5, attempts=4, backoff_s=2)
-
-
-class Model(Llm):
-    """A model that notes its pauses in place of waiting."""
-
-    def __init__(self, config: LlmConfig) -> None:
-        self.pauses: list[float] = []
-        super().__init__(config, sleep=self.pauses.append)
 
 
 # The question and the answer
@@ -105,132 +93,23 @@ def test_a_known_model_has_a_price_and_an_unknown_one_none(server: LlmServer, co
     assert priced.usage.cost_usd > unpriced.usage.cost_usd == 0
 
 
-# Failures that pass
-
-
-PASSING = {
-    "429": failure(429, "slow down"),
-    "500": failure(500, "oops"),
-    "502": failure(502, "gateway"),
-    "503": failure(503, "busy"),
-    "408": failure(408, "too slow"),
-    "a page": Answer(body="<html>busy</html>"),
-    "half of a reply": Answer(body='{"choices": [{"mess'),
-    "another object": Answer(body={"hello": 1}),
-    "a list": Answer(body=[1, 2]),
-    "null": Answer(body="null"),
-}
-
-
-@pytest.mark.parametrize("answer", PASSING.values(), ids=PASSING)
-def test_transient_failures_are_retried(server: LlmServer, config: LlmConfig, answer: Answer) -> None:
-    server.say(answer, answer, "x = 1")
-    model = Model(config)
-    assert model.complete(QUESTION).text == "x = 1"
-    assert len(server.requests) == 3
-    assert model.usage == Usage(calls=1, retries=2, prompt_tokens=11, completion_tokens=7, unpriced=1)
-
-
-def test_pauses_double_with_random_jitter(server: LlmServer, config: LlmConfig) -> None:
-    server.say(failure(500, "oops"))
-    model = Model(config)
-    with pytest.raises(LlmError, match=r"openai/local: .*oops"):
-        model.complete(QUESTION)
-    assert len(server.requests) == config.attempts
-    assert [int(pause // 2) for pause in model.pauses] == [1, 2, 4]
-    assert all(0 <= pause - 2 * 2**i <= 1 for i, pause in enumerate(model.pauses))
-
-
-@pytest.mark.parametrize(("asked", "waited"), [("7", 7.0), ("0.5", 0.5), ("9999", 60.0), ("-3", 0.0)])
-def test_retry_after_in_seconds_is_honoured(server: LlmServer, config: LlmConfig, asked: str, waited: float) -> None:
-    server.say(failure(429, "slow down", Retry_After=asked), "x = 1")
-    model = Model(config)
-    model.complete(QUESTION)
-    assert model.pauses == [waited]
-
-
-def test_retry_after_as_a_date_is_honoured(server: LlmServer, config: LlmConfig) -> None:
-    then = format_datetime(datetime.now(UTC) + timedelta(seconds=40), usegmt=True)
-    server.say(failure(503, "busy", Retry_After=then), "x = 1")
-    model = Model(config)
-    model.complete(QUESTION)
-    assert 20 < model.pauses[0] <= 41
-
-
-def test_an_invalid_retry_after_falls_back_to_the_default_pause(server: LlmServer, config: LlmConfig) -> None:
-    server.say(failure(429, "slow down", Retry_After="soon"), "x = 1")
-    model = Model(config)
-    model.complete(QUESTION)
-    assert 2 <= model.pauses[0] <= 3
-
-
-def test_timeouts_are_retried(server: LlmServer, config: LlmConfig) -> None:
-    server.say(HANG, "x = 1")
-    model = Model(replace(config, timeout_s=0.3))
-    assert model.complete(QUESTION).text == "x = 1"
-    assert model.usage.retries == 1
-
-
-def test_an_unreachable_server_is_reported_after_all_attempts(config: LlmConfig) -> None:
-    model = Model(replace(config, api_base="http://127.0.0.1:9/v1"))
-    with pytest.raises(LlmError, match="openai/local: ") as caught:
-        model.complete(QUESTION)
-    assert not isinstance(caught.value, ReplyError)
-    assert model.usage.retries == 3
-
-
-# Failures that stay
-
-
-@pytest.mark.parametrize("status", [400, 401, 403, 404])
-def test_client_errors_are_not_retried(server: LlmServer, config: LlmConfig, status: int) -> None:
-    server.say(failure(status, "no such key"))
-    model = Model(config)
-    with pytest.raises(LlmError, match="no such key") as caught:
-        model.complete(QUESTION)
-    assert len(server.requests) == 1
-    assert model.pauses == []
-    assert re.fullmatch(r"openai/local: \w+Error: no such key", str(caught.value))
-    assert "secret" not in str(caught.value)
-
-
-def test_a_truncated_answer_is_an_error_that_names_the_limit(server: LlmServer, config: LlmConfig) -> None:
-    server.say(code("x = 1\ny = ", finish="length"))
-    model = Model(config)
-    with pytest.raises(ReplyError, match="openai/local: the answer is cut off at 512 tokens; raise max_tokens"):
-        model.complete(QUESTION)
-    assert model.usage.calls == 1
-
-
-@pytest.mark.parametrize("text", [None, "", "  \n ", "# Query: again"])
-def test_an_empty_answer_is_an_error(server: LlmServer, config: LlmConfig, text: str | None) -> None:
-    server.say(code(text))
-    with pytest.raises(ReplyError, match="the answer is empty"):
-        Model(config).complete(QUESTION, stop=("# Query: ",))
-
-
-def test_a_response_without_choices_is_an_error(server: LlmServer, config: LlmConfig) -> None:
-    server.say(Answer(body={"id": "x", "object": "chat.completion", "created": 0, "model": "local", "choices": []}))
-    with pytest.raises(LlmError, match="no answer in it"):
-        Model(config).complete(QUESTION)
-
-
-def test_a_missing_key_is_reported_without_retries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("OPENAI_API_KEY", "OPENAI_ADMIN_KEY"):
-        monkeypatch.delenv(name, raising=False)
-    model = Model(LlmConfig(model="gpt-4o"))
-    with pytest.raises(LlmError, match=r"gpt-4o: .*OPENAI_API_KEY"):
-        model.complete(QUESTION)
-    assert model.pauses == []
+# What is configured
 
 
 def test_a_key_is_not_shown(config: LlmConfig) -> None:
     assert "secret" not in repr(config)
 
 
-@pytest.mark.parametrize("wrong", [{"model": ""}, {"attempts": 0}, {"timeout_s": 0}, {"backoff_s": -1}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"model": ""}, {"model": "offline/other"}, {"attempts": 0}, {"timeout_s": 0}, {"backoff_s": -1}),
+        *({"concurrency": 0}, {"options": {"stream": True}}),
+    ],
+    ids=str,
+)
 def test_invalid_configs_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"model|attempts"):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
         LlmConfig(**wrong)
 
 

@@ -19,7 +19,7 @@ from voxposer.language.lmp import Lmps, build_lmps
 from voxposer.language.lmp_config import CONFIGS, MAPS, NAMES, LmpError
 from voxposer.language.observations import LazyMap
 from voxposer.language.prompts import code_in, load_prompts
-from voxposer.language.replies import LlmError
+from voxposer.language.replies import LlmError, ReplyError
 from voxposer.sandbox.guard import Limits
 
 # Of a library that litellm uses.
@@ -109,13 +109,15 @@ def test_an_answer_that_is_not_a_program_is_not_cached(setup: Callable[..., Setu
 @pytest.mark.parametrize(
     ("answer", "told"), [(code("x = 1", finish="length"), "cut off at 512 tokens"), (code(""), "empty")]
 )
-def test_a_truncated_or_empty_answer_is_an_error_of_the_lmp(
+def test_a_truncated_or_empty_answer_is_an_error_of_the_model_and_not_of_its_program(
     setup: Callable[..., Setup], answer: Answer, told: str
 ) -> None:
     robot = setup({("composer", "go"): answer})
-    with pytest.raises(LmpError, match=rf"composer\('go'\): openai/local: .*{told}") as caught:
+    with pytest.raises(ReplyError, match=rf"^openai/local: .*{told}") as caught:
         robot.lmps.composer("go")
-    assert (caught.value.rule, caught.value.line) == ("reply", None)
+    assert caught.value.__notes__ == ["requested by composer('go')"]
+    call = call_of(robot.lmps, "composer")
+    assert (call.prompt_tokens, call.error) == (11, str(caught.value))
 
 
 def test_a_provider_error_is_not_an_error_of_a_program(setup: Callable[..., Setup]) -> None:

@@ -20,7 +20,7 @@ from vecenv.manipulation.routes import RouteConfig
 from vecenv.observations import ObjectsSnapshot
 from voxposer.agent import Agent, AgentConfig
 from voxposer.interface import Interface
-from voxposer.language.llm import Llm
+from voxposer.language.llm import Llm, LlmConfig
 from voxposer.language.replies import LlmError, Reply
 from voxposer.paths import obstacle_map, plan_paths
 from voxposer.perception.config import HandState
@@ -213,7 +213,7 @@ class Scripted(Llm):
     """A language model that has one reply for each LMP, by what the query says."""
 
     def __init__(self, replies: dict[str, str]) -> None:
-        super().__init__()
+        super().__init__(LlmConfig(model="scripted"))
         self.replies, self.asked = replies, []
 
     def complete(self, messages: Any, **options: Any) -> Reply:
@@ -327,8 +327,10 @@ def test_the_policy_reports_what_an_episode_took() -> None:
     list(drive(cast(BatchEnv, env), policy))
     said = extras_of(policy, 0)
     assert said["subtasks"] == 2
-    assert said["llm_calls"] == len(acting.slots[0].lmps.trace) > 3
-    assert said["llm_cost_usd"] == pytest.approx(0.5 * said["llm_calls"])
+    assert said["questions"] == len(acting.slots[0].lmps.trace) > 3
+    assert said["writer"] == "offline/libero, rule-based"  # the policy's own model
+    assert (said["llm_cost_usd"], said["llm_tokens"]) == (0.5 * said["questions"], 5 * said["questions"])
+    assert said["repairs"] == 0
     assert said["waypoints"] > 0
     assert said["cause"] == "followed to the end without success"
 

@@ -56,11 +56,14 @@ def test_a_motion_shows_targets_planned_path_and_hand_route() -> None:
 
 
 def test_the_page_has_every_program_and_its_source() -> None:
-    page = render_page(shown())
+    page = render_page(shown(model="gpt-4o"))
     for text in ("execute(&#x27;&lt;b&gt;&#x27;)", "from the cache", "went wrong", "0.2500 US dollars", "lift higher"):
         assert text in page
     assert "lift &lt;it&gt; &amp; hold" in page
-    assert "rule-based, no language model" in page
+    by_rule = render_page(shown())
+    assert "rule-based, no language model" in by_rule
+    assert "dollars" not in by_rule.split("<body>")[1]
+    assert "tokens" not in by_rule.split("<body>")[1]
     assert "rule-based" not in render_page(shown(model="gpt-4o")).split("<h2>Motions")[0].split("<body>")[1]
 
 

@@ -1,12 +1,14 @@
 """Requests to a language model through litellm: retried, counted and cached.
 
-In: chat messages, and which model of which provider (any string litellm knows; ``offline/libero``, the default, is
-``voxposer.offline`` and needs neither key nor network). Out: the text up to the first stop token, with its tokens and
-cost. Calls that fail for a passing reason (429, 5xx, timeouts, lost connections, replies that are no JSON) are repeated
-with growing pauses, or after the pause the server asks for.
+In: chat messages, and which model of which provider (any string litellm knows; ``offline/libero``, the default, is the
+rule base in ``voxposer.offline``, no language model, and needs neither key nor network). Out: the text up to the first
+stop token, with its tokens and cost. Calls that fail for a passing reason (429, 5xx, timeouts, lost connections,
+replies that are no JSON) are repeated with growing pauses, or after the pause the server asks for. What no waiting ends
+(a wrong key, an unknown model, no credit) is an error at once, marked as permanent.
 
 Complete replies are kept on disk (``voxposer.language.reply_cache``). The offline writer's replies are kept in memory
-only: they cost nothing, and another version may write others.
+only: they cost nothing, and another version may write others. Threads that ask the same at the same time share one
+request.
 
 Needs the extra ``voxposer``; litellm is imported at the first question.
 """
@@ -16,16 +18,17 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from voxposer.language import providers
-from voxposer.language.replies import LlmError, Message, Reply, ReplyError, Usage
+from voxposer.language.replies import LlmError, Message, NoRuleError, Reply, ReplyError, Usage
 from voxposer.language.reply_cache import cache_at
+from voxposer.offline.provider import MODEL as OFFLINE_MODEL
 from voxposer.offline.provider import register
 
 if TYPE_CHECKING:
@@ -34,6 +37,11 @@ if TYPE_CHECKING:
 OFFLINE = "offline/"
 # Layout of requests and replies on disk; raised when it changes.
 FORMAT = 1
+# Arguments of ``litellm.completion`` that have a setting of their own, or that this module decides.
+_RESERVED = frozenset(
+    {"model", "messages", "stop", "max_tokens", "temperature", "timeout", "api_base", "api_key", "stream", "n"}
+    | {"max_retries", "num_retries", "drop_params"}
+)
 
 
 class Response(Protocol):
@@ -45,25 +53,29 @@ class Response(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class LlmConfig:
-    """Which model is asked, and how often and how long.
+    """Which model is asked, how, how often and how long.
 
     Attributes:
         model: litellm's name of it, such as ``gpt-4o`` or ``openai/local``; ``offline/libero`` is rule-based and local.
+        seed: of its answers, for providers that take one.
         timeout_s: seconds for one attempt.
         attempts: how often a question is asked before giving up; the offline writer is asked once.
         backoff_s: seconds of the first pause; each is twice as long as the one before, plus up to a second at random.
         backoff_max_s: seconds of the longest pause, also of one that the server asks for.
+        concurrency: most questions that wait for an answer at once.
         api_base: address of the provider; litellm's own by default.
         api_key: litellm reads the provider's variable (``OPENAI_API_KEY``) by default. Never stored or shown.
-        options: further arguments of ``litellm.completion``, such as ``seed``.
+        options: further arguments of ``litellm.completion``, such as ``top_p``.
         cache: whether replies are kept, or the folder to keep them in.
     """
 
-    model: str = "offline/libero"
+    model: str = OFFLINE_MODEL
+    seed: int | None = None
     timeout_s: float = 60.0
     attempts: int = 6
     backoff_s: float = 1.0
     backoff_max_s: float = 60.0
+    concurrency: int = 8
     api_base: str | None = None
     api_key: str | None = field(default=None, repr=False)
     options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
@@ -71,32 +83,65 @@ class LlmConfig:
 
     def __post_init__(self) -> None:
         if not self.model:
-            raise ValueError("model is empty; name one, such as gpt-4o or offline/libero")
+            raise ValueError(f"model is empty; name one, such as gpt-4o or {OFFLINE_MODEL}")
+        if self.is_rule_base and self.model != OFFLINE_MODEL:
+            raise ValueError(f"there is no model {self.model!r}; the rule base is {OFFLINE_MODEL}")
         if self.attempts < 1 or self.timeout_s <= 0 or self.backoff_s < 0 or self.backoff_max_s < 0:
-            raise ValueError(f"attempts must be at least 1, timeout_s above 0 and backoffs not below 0: {self}")
+            raise ValueError("attempts must be at least 1, timeout_s above 0, backoff_s and backoff_max_s not below 0")
+        if self.concurrency < 1:
+            raise ValueError(f"concurrency must be at least 1, not {self.concurrency}")
+        if reserved := sorted(_RESERVED.intersection(self.options)):
+            raise ValueError(f"options cannot hold {', '.join(reserved)}: a setting of its own decides it")
+
+    @property
+    def is_rule_base(self) -> bool:
+        """Whether programs are written by rules, so that there are neither tokens nor a price."""
+        return self.model.startswith(OFFLINE)
+
+    def settings(self, max_tokens: int, temperature: float) -> dict[str, Any]:
+        """What a question is asked with besides its messages and stop tokens, ready for JSON; without the key."""
+        seed = {} if self.seed is None else {"seed": self.seed}
+        return {
+            "model": self.model,
+            "api_base": self.api_base,
+            "max_tokens": max_tokens,
+            "temperature": temperature,
+            "options": {**self.options, **seed},
+        }
 
 
 class Llm:
     """A model with its cache and usage counts. Threads may share one."""
 
-    def __init__(self, config: LlmConfig | None = None, *, sleep: Callable[[float], None] = time.sleep) -> None:
+    def __init__(self, config: LlmConfig | None = None, *, sleep: Callable[[float], object] | None = None) -> None:
         """A model as configured, the offline writer by default; nothing is imported or opened before a question.
 
         Args:
             config: which model, and how.
-            sleep: waits a number of seconds between attempts.
+            sleep: waits a number of seconds between attempts; by default until then or until :meth:`close`.
         """
         self.config = config or LlmConfig()
-        self._sleep = sleep
+        self._closed = threading.Event()
+        self._sleep = sleep or self._closed.wait
         self._usage, self._lock = Usage(), threading.Lock()
         self._memory: dict[str, Reply] = {}
-        self._disk = None if self._is_offline() else cache_at(self.config.cache)
+        self._pending: dict[str, Future[Reply]] = {}
+        self._disk = None if self.config.is_rule_base else cache_at(self.config.cache)
 
     @property
     def usage(self) -> Usage:
         """Requests and cost of this object so far."""
         with self._lock:
             return self._usage
+
+    def for_episode(self, episode: str) -> Self:
+        """What answers the questions of one episode, by its name: this object, unless replies depend on it."""
+        del episode
+        return self
+
+    def close(self) -> None:
+        """Ask nothing again; questions under way end with their present attempt."""
+        self._closed.set()
 
     def complete(
         self,
@@ -105,6 +150,7 @@ class Llm:
         stop: Sequence[str] = (),
         max_tokens: int = 512,
         temperature: float = 0.0,
+        note: Callable[[Reply], object] | None = None,
         check: Callable[[str], object] | None = None,
     ) -> Reply:
         """The model's answer to a conversation.
@@ -114,62 +160,72 @@ class Llm:
             stop: the answer ends before the first of these; they also go to the provider where it takes them.
             max_tokens: length of the answer at most.
             temperature: 0 for the likeliest answer.
+            note: called with the answer before it is checked.
             check: called with the text of a new answer; if it raises, so does this, and the answer is not kept.
 
         Raises:
-            ReplyError: the answer is cut off at ``max_tokens`` or empty, or the offline writer does not understand.
+            NoRuleError: the offline writer does not understand the query.
+            ReplyError: the answer is cut off at ``max_tokens`` or empty.
             LlmError: no answer came, however often asked, or the provider refuses (a wrong key, an unknown model).
         """
         request = self._request(messages, stop, max_tokens, temperature)
+        look = _Look(note or _ignored, check or _ignored)
+        if not self.config.cache:
+            return look(self._with_retries(request))
         key = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
-        kept = self._kept(key)
+        with self._lock:
+            kept, other = self._memory.get(key), self._pending.get(key)
+            if kept is None and other is None:
+                mine = self._pending[key] = Future()
         if kept is not None:
             self._count(Usage(cached=1))
             return kept
-        reply = self._with_retries(request)
-        if check is not None:
-            check(reply.text)
-        self._keep(key, request, reply)
-        return reply
-
-    def _is_offline(self) -> bool:
-        return self.config.model.startswith(OFFLINE)
+        if other is not None:
+            return look(self._of_other(other))
+        return self._first(key, request, mine, look)
 
     def _request(
         self, messages: Sequence[Message], stop: Sequence[str], max_tokens: int, temperature: float
     ) -> dict[str, Any]:
         """Everything that decides the answer, ready for JSON."""
-        return {
-            "format": FORMAT,
-            "model": self.config.model,
-            "api_base": self.config.api_base,
-            "messages": [dict(message) for message in messages],
-            "stop": list(stop),
-            "max_tokens": max_tokens,
-            "temperature": temperature,
-            "options": dict(self.config.options),
-        }
+        said = {"messages": [dict(message) for message in messages], "stop": list(stop)}
+        return {"format": FORMAT, **said, **self.config.settings(max_tokens, temperature)}
 
     # What is kept
 
-    def _kept(self, key: str) -> Reply | None:
-        if not self.config.cache:
-            return None
-        with self._lock:
-            reply = self._memory.get(key)
-        if reply is None and self._disk is not None:
-            reply = self._disk.get(key)
-        if reply is None:
-            return None
-        with self._lock:
-            return self._memory.setdefault(key, replace(reply, cached=True))
+    def _first(self, key: str, request: Mapping[str, Any], mine: Future[Reply], look: _Look) -> Reply:
+        """The answer from the disk or the model; who asks the same meanwhile gets it too, and whoever asks later."""
+        try:
+            kept = None if self._disk is None else self._disk.get(key)
+            reply = self._with_retries(request) if kept is None else replace(kept, cached=True)
+            mine.set_result(reply)
+            if kept is not None:
+                self._count(Usage(cached=1))
+            else:
+                look(reply)
+            self._keep(key, request, reply)
+            return reply
+        except BaseException as error:
+            if not mine.done():
+                mine.set_exception(error)
+            raise
+        finally:
+            with self._lock:
+                del self._pending[key]
+
+    def _of_other(self, other: Future[Reply]) -> Reply:
+        """What came of the same request, which another thread has made."""
+        try:
+            reply = replace(other.result(), cached=True)
+        except LlmError as error:
+            raise error.again() from error
+        self._count(Usage(cached=1))
+        return reply
 
     def _keep(self, key: str, request: Mapping[str, Any], reply: Reply) -> None:
-        if not self.config.cache:
-            return
         with self._lock:
             self._memory[key] = replace(reply, cached=True)
-        if self._disk is not None:
+        if self._disk is not None and not reply.cached:
             self._disk.put(key, request, reply)
 
     def _count(self, used: Usage) -> None:
@@ -179,33 +235,25 @@ class Llm:
     # The question
 
     def _with_retries(self, request: Mapping[str, Any]) -> Reply:
-        response = self._answered(request)
-        reply = self._reply(response, request["stop"])
-        self._count(
-            Usage(
-                calls=1,
-                prompt_tokens=reply.prompt_tokens,
-                completion_tokens=reply.completion_tokens,
-                cost_usd=reply.cost_usd or 0.0,
-                unpriced=int(reply.cost_usd is None),
-            )
-        )
+        model = self.config.model
+        reply = self._reply(self._answered(request), request["stop"])
+        self._count(Usage(calls=1) if self.config.is_rule_base else Usage.of(reply))
         if reply.finish_reason == "length":
             limit = request["max_tokens"]
-            raise ReplyError(self.config.model, f"the answer is cut off at {limit} tokens; raise max_tokens")
+            raise ReplyError(model, f"the answer is cut off at {limit} tokens; raise max_tokens", reply=reply)
         if not reply.text:
-            raise ReplyError(self.config.model, f"the answer is empty (it ended with {reply.finish_reason!r})")
+            raise ReplyError(model, f"the answer is empty (it ended with {reply.finish_reason!r})", reply=reply)
         return reply
 
     def _answered(self, request: Mapping[str, Any]) -> Any:
         """The provider's response, after as many attempts as it takes and is allowed."""
         litellm, tenacity = providers.litellm(), providers.tenacity()
-        transient = tuple(getattr(litellm, name) for name in providers.TRANSIENT)
         doubling = tenacity.wait_exponential(multiplier=self.config.backoff_s, max=self.config.backoff_max_s)
         pauses = doubling + tenacity.wait_random(0, min(self.config.backoff_s, 1.0))
+        most = 1 if self.config.is_rule_base else self.config.attempts
         retrying = tenacity.Retrying(
-            retry=tenacity.retry_if_exception(lambda error: isinstance(error, transient) and not self._lacks_key()),
-            stop=tenacity.stop_after_attempt(1 if self._is_offline() else self.config.attempts),
+            retry=tenacity.retry_if_exception(self._may_pass),
+            stop=tenacity.stop_after_attempt(most) | tenacity.stop_when_event_set(self._closed),
             wait=lambda state: self._pause(state, pauses),
             before_sleep=lambda state: self._count(Usage(retries=1)),
             sleep=self._sleep,
@@ -214,19 +262,27 @@ class Llm:
         try:
             return retrying(self._attempt, litellm, request)
         except Exception as error:  # litellm passes on whatever a provider's code raises
-            kind = ReplyError if self._is_offline() else LlmError
-            reason = providers.first_line(error)
-            named = reason if self._is_offline() else f"{type(error).__name__}: {reason}"
-            raise kind(self.config.model, named) from error
+            raise self._error(error, retrying.statistics.get("attempt_number", 1)) from error
+
+    def _error(self, error: Exception, attempts: int) -> LlmError:
+        """What a request ended with, as one of ours."""
+        model = self.config.model
+        if self.config.is_rule_base:
+            return NoRuleError(model, providers.first_line(error))
+        if self._lacks_key():
+            return LlmError(model, providers.reason(error, model), permanent=True)
+        tries = f" ({attempts} attempts)" if attempts > 1 else ""
+        return LlmError(model, providers.reason(error, model) + tries, permanent=providers.is_permanent(error))
+
+    def _may_pass(self, error: BaseException) -> bool:
+        return providers.may_pass(error) and not self._lacks_key()
 
     def _lacks_key(self) -> bool:
         """Whether the provider's key is missing, which litellm reports as if the provider had failed."""
-        if self.config.api_key is not None:
-            return False
-        return bool(providers.litellm().validate_environment(self.config.model)["missing_keys"])
+        return self.config.api_key is None and providers.lacks_key(self.config.model)
 
     def _attempt(self, litellm: ModuleType, request: Mapping[str, Any]) -> Any:
-        if self._is_offline():
+        if self.config.is_rule_base:
             register()
         return litellm.completion(
             **{"max_retries": 0, "num_retries": 0, "drop_params": True},
@@ -249,15 +305,40 @@ class Llm:
         choices = getattr(response, "choices", None)
         if not choices:
             raise ReplyError(self.config.model, "the response has no answer in it")
-        usage = getattr(response, "usage", None)
+        sent, made = _tokens(response)
+        unknown = self.config.is_rule_base or sent is None
         return Reply(
             text=_until(stop, choices[0].message.content or ""),
             model=response.model or self.config.model,
             finish_reason=choices[0].finish_reason or "stop",
-            prompt_tokens=getattr(usage, "prompt_tokens", None) or 0,
-            completion_tokens=getattr(usage, "completion_tokens", None) or 0,
-            cost_usd=0.0 if self._is_offline() else providers.price(response, self.config.model),
+            prompt_tokens=None if unknown else sent,
+            completion_tokens=None if unknown else made,
+            cost_usd=None if unknown else providers.price(response, self.config.model),
         )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What a caller does with a new answer: notes it, then checks its text."""
+
+    note: Callable[[Reply], object]
+    check: Callable[[str], object]
+
+    def __call__(self, reply: Reply) -> Reply:
+        self.note(reply)
+        self.check(reply.text)
+        return reply
+
+
+def _ignored(value: object) -> None:
+    """Does nothing."""
+
+
+def _tokens(response: Response) -> tuple[int | None, int | None]:
+    """Tokens of question and answer; litellm puts 0 where the provider does not say, and no question has none."""
+    usage = getattr(response, "usage", None)
+    sent, made = getattr(usage, "prompt_tokens", None), getattr(usage, "completion_tokens", None)
+    return (sent, made) if sent else (None, None)
 
 
 def _until(stop: Sequence[str], text: str) -> str:

@@ -24,29 +24,31 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from voxposer.language.llm import Llm
 from voxposer.language.lmp_config import ACTIONS, CONFIGS, MAPS, RESTRICTED, Call, LmpConfig, LmpError
 from voxposer.language.observations import DynamicObservation, DynamicObservations, LazyMap, Observation
-from voxposer.language.prompts import chat_messages, code_in, lines, load_prompts, query_line
-from voxposer.language.replies import LlmError, Message, Reply, ReplyError
+from voxposer.language.prompts import chat_messages, code_in, lines, load_prompts, query_line, repair_messages
+from voxposer.language.replies import LlmError, Message, NoRuleError, Reply
 from voxposer.sandbox import interpreter as sandbox
 from voxposer.sandbox.guard import Budget, HostFault, Limits, RecordList
 from voxposer.sandbox.interpreter import Program
 from voxposer.sandbox.syntax import SandboxError
 
+T = TypeVar("T")
 # Subtasks of one instruction, and characters of one query.
 _SUBTASKS, _QUERY_CHARS = 100, 1000
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class _Written:
-    """A program that the model wrote for a query."""
+    """A program that the model wrote for a query; a repaired one takes its place."""
 
     config: LmpConfig
     query: str
@@ -69,6 +71,9 @@ class Lmps:
         *,
         limits: Limits | None = None,
         configs: Mapping[str, LmpConfig] = CONFIGS,
+        repairs: int = 0,
+        undo: Callable[[], None] | None = None,
+        aside: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
     ) -> None:
         """Language programs over functions; ``build_lmps`` loads the prompts.
 
@@ -78,10 +83,17 @@ class Lmps:
             prompts: text of each LMP's examples.
             limits: what a program may use.
             configs: the LMPs.
+            repairs: how often the model is shown what its program did wrong and asked for another. A rule base would
+                write the same again; it is not asked.
+            undo: forgets what the composer's functions did since its program began. Without it, a composer's program
+                that failed while it ran is not repaired.
+            aside: what to be inside while the model is waited for.
         """
         self.trace: list[Call] = []
         self._llm, self._prompts, self._configs = llm, dict(prompts), dict(configs)
         self._limits = limits or Limits()
+        self._repairs = 0 if llm.config.is_rule_base else repairs
+        self._undo, self._aside = undo, aside
         self._functions = dict(functions) | self._own_functions()
         self._objects: tuple[str, ...] | None = None
         self._budget: Budget | None = None
@@ -118,11 +130,11 @@ class Lmps:
             LmpError: a program, this one's or one it called, cannot be run.
             LlmError: the model does not answer.
         """
-        self._execute(self._write("planner", query), self._functions)
+        self._execute(self._write("planner", query), self._functions)  # subtasks that are done cannot be undone
 
     def composer(self, query: str) -> None:
         """Carry out one subtask: run the program that calls ``execute``. Raises as ``planner``."""
-        self._execute(self._write("composer", query), self._functions)
+        self._run(self._write("composer", query), self._functions, self._undo)
 
     def parse_query_obj(self, query: str) -> DynamicObservation | DynamicObservations:
         """The object that a query refers to, or several where the program returns a list.
@@ -159,7 +171,7 @@ class Lmps:
         """The subtasks of an instruction, in order; nothing is executed. Raises as ``planner``."""
         subtasks: list[str] = []
         written = self._write("planner", query)
-        self._execute(written, self._functions | {"composer": _recorder(subtasks)})
+        self._run(written, self._functions | {"composer": _recorder(subtasks)}, subtasks.clear)
         return tuple(subtasks)
 
     # Results
@@ -170,7 +182,9 @@ class Lmps:
 
     def _voxels(self, written: _Written) -> np.ndarray:
         """The map that a program returns, checked."""
-        value = self._execute(written, self._functions)
+        return self._run(written, self._functions, _nothing, self._as_voxels)
+
+    def _as_voxels(self, written: _Written, value: Any) -> np.ndarray:
         tail = (4,) if written.config.name == "get_rotation_map" else ()
         shape = np.shape(value) if isinstance(value, np.ndarray) else (0,)
         if shape != (shape[0],) * 3 + tail:
@@ -181,7 +195,9 @@ class Lmps:
         return np.asarray(value, np.float64)
 
     def _things(self, written: _Written) -> Observation | list[Observation]:
-        value = self._execute(written, self._functions)
+        return self._run(written, self._functions, _nothing, self._as_things)
+
+    def _as_things(self, written: _Written, value: object) -> Observation | list[Observation]:
         single = not isinstance(value, (list, tuple, RecordList))
         things = [_static(item) for item in ([value] if single else value)]
         if not things or any(thing is None for thing in things):
@@ -204,18 +220,48 @@ class Lmps:
     # Writing programs
 
     def _write(self, name: str, query: object) -> _Written:
-        """Request the program for a query from the model."""
+        """Request the program for a query from the model, and another if it cannot be run."""
         config, words = self._configs[name], self._words(name, query)
         context = self._context(config, words)
-        call = Call(lmp=name, query=words, context=context, model=self._llm.config.model)
+        call = self._new_call(config, words, context, self._messages(config, context, words))
+        while True:
+            try:
+                return self._ask(config, call)
+            except LmpError as error:
+                call = self._repair_of(config, call, error)
+
+    def _new_call(
+        self, config: LmpConfig, query: str, context: str, messages: Sequence[Message], repair: int = 0
+    ) -> Call:
+        """A question that is about to be asked."""
         if self._budget is not None:
             self._budget.program()
+        call = Call(
+            lmp=config.name,
+            query=query,
+            context=context,
+            model=self._llm.config.model,
+            repair=repair,
+            messages=messages,
+            stop=config.stop,
+            settings=self._llm.config.settings(config.max_tokens, config.temperature),
+        )
         self.trace.append(call)
+        return call
+
+    def _ask(self, config: LmpConfig, call: Call) -> _Written:
+        """Ask the model, and parse what it answers."""
         with self._inside(call), self._clock_stopped():
             reply = self._reply(config, call)
-            call.cached, call.cost_usd = reply.cached, reply.cost_usd
-            call.prompt_tokens, call.completion_tokens = reply.prompt_tokens, reply.completion_tokens
-            return _Written(config=config, query=words, program=self._parsed(call, reply.text), call=call)
+            call.note(reply)
+            return _Written(config=config, query=call.query, program=self._parsed(call, reply.text), call=call)
+
+    def _repair_of(self, config: LmpConfig, call: Call, error: LmpError) -> Call:
+        """The question that shows the model what its program did wrong; raises the error if none is to be asked."""
+        if call.repair >= self._repairs or call.reply is None or error.rule in ("query", "reply"):
+            raise error
+        messages = repair_messages(config, call.messages, call.reply, str(error), call.context, call.query)
+        return self._new_call(config, call.query, call.context, messages, call.repair + 1)
 
     def _words(self, name: str, query: object) -> str:
         """A query as one line, without the full stop at its end."""
@@ -234,25 +280,30 @@ class Lmps:
         return f"objects = {list(self._objects)}"
 
     def _reply(self, config: LmpConfig, call: Call) -> Reply:
+        """The model's answer; that a rule base has no rule for the query is an error of the LMP."""
         try:
-            return self._llm.complete(
-                self._messages(config, call),
-                stop=config.stop,
-                max_tokens=config.max_tokens,
-                temperature=config.temperature,
-                check=lambda text: self._parsed(call, text),
-            )
-        except ReplyError as error:
+            with self._aside():
+                return self._llm.complete(
+                    call.messages,
+                    stop=config.stop,
+                    max_tokens=config.max_tokens,
+                    temperature=config.temperature,
+                    note=call.note,
+                    check=lambda text: self._parsed(call, text),
+                )
+        except NoRuleError as error:
             raise LmpError(call.lmp, call.query, "reply", str(error)) from error
         except LlmError as error:
+            if error.reply is not None:
+                call.note(error.reply)
             error.add_note(f"requested by {call.lmp}({call.query!r})")
             raise
 
-    def _messages(self, config: LmpConfig, call: Call) -> list[Message]:
+    def _messages(self, config: LmpConfig, context: str, query: str) -> list[Message]:
         """The request: examples and earlier exchanges first, then the query with its context."""
         session = self._sessions.get(config.name, "")
         prompt = self._prompt(config) + (f"\n\n{session}" if session else "")
-        return chat_messages(config, prompt, call.context, call.query)
+        return chat_messages(config, prompt, context, query)
 
     def _prompt(self, config: LmpConfig) -> str:
         """The examples, with upstream's placeholder for the line that imports the functions."""
@@ -268,6 +319,35 @@ class Lmps:
             raise LmpError(call.lmp, call.query, error.rule, reason, error.line) from error
 
     # Running programs
+
+    def _run(
+        self,
+        written: _Written,
+        functions: Mapping[str, Callable[..., Any]],
+        undo: Callable[[], None] | None,
+        take: Callable[[_Written, Any], T] = lambda written, value: value,
+    ) -> T:
+        """What ``take`` makes of the value of a program; a program that fails is repaired where that may be undone."""
+        while True:
+            try:
+                return take(written, self._execute(written, functions))
+            except LmpError as error:
+                own = (error.lmp, error.query) == (written.config.name, written.query)
+                if undo is None or not own:
+                    raise
+                self._repair(written, error)
+            undo()
+
+    def _repair(self, written: _Written, error: LmpError) -> None:
+        """Put another program of the model in the place of one that failed; raises the error if there is none."""
+        call = self._repair_of(written.config, written.call, error)
+        while True:
+            try:
+                repaired = self._ask(written.config, call)
+                break
+            except LmpError as other:
+                call = self._repair_of(written.config, call, other)
+        written.program, written.call = repaired.program, repaired.call
 
     def _execute(self, written: _Written, functions: Mapping[str, Callable[..., Any]]) -> Any:
         """Run a program; its errors are reported as errors of this LMP."""
@@ -337,6 +417,7 @@ def build_lmps(
     prompts_dir: str | Path | None = None,
     limits: Limits | None = None,
     configs: Mapping[str, LmpConfig] = CONFIGS,
+    **options: Any,
 ) -> Lmps:
     """The language programs with their prompts loaded.
 
@@ -347,17 +428,22 @@ def build_lmps(
             prompts by default.
         limits: what a program may use.
         configs: the LMPs.
+        **options: ``repairs``, ``undo`` and ``aside`` as for ``Lmps``.
 
     Raises:
         FileNotFoundError: a prompt is missing.
     """
-    return Lmps(functions, llm, load_prompts(prompts_dir), limits=limits, configs=configs)
+    return Lmps(functions, llm, load_prompts(prompts_dir), limits=limits, configs=configs, **options)
 
 
 @functools.lru_cache(maxsize=4096)
 def _parse(code: str, limits: Limits) -> Program:
     """A parsed program, cached: the episodes of a batch share the same few."""
     return sandbox.parse(code, limits=limits)
+
+
+def _nothing() -> None:
+    """Undoes a program that did nothing but compute."""
 
 
 def _recorder(subtasks: list[str]) -> Callable[[Any], None]:

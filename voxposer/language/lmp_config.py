@@ -5,10 +5,12 @@ Plain tables and records; ``voxposer.language.lmp`` runs the programs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
+from voxposer.language.replies import Message, Reply
 from voxposer.sandbox.guard import HostFault
 
 MAPS = ("get_affordance_map", "get_avoidance_map", "get_rotation_map", "get_velocity_map", "get_gripper_map")
@@ -61,6 +63,10 @@ class LmpConfig:
     has_return: bool = True
     return_val_name: str = "ret_val"
 
+    def __post_init__(self) -> None:
+        if self.max_tokens < 1 or not self.temperature >= 0:
+            raise ValueError(f"{self.name}: max_tokens must be at least 1 and temperature not below 0")
+
 
 CONFIGS: Mapping[str, LmpConfig] = MappingProxyType(
     {
@@ -86,16 +92,22 @@ RESTRICTED = frozenset(name for names in ACTIONS.values() for name in names)
 
 @dataclass(kw_only=True)
 class Call:
-    """One question to the model, for people to read.
+    """One question to the model, and what came of it: for people to read, and to be asked again without the model.
 
     Attributes:
         lmp: which language program.
         query: what it was asked.
         context: the context line, empty without.
         model: the model asked.
-        code: its answer without fences; empty if there was none.
+        repair: 0 for the question itself, 1 for the first question that shows the model what its program did wrong.
+        messages: the conversation that was sent.
+        stop: the tokens that the answer was to end at.
+        settings: what else the question was asked with (``voxposer.language.llm.LlmConfig.settings``).
+        reply: the answer as it came, None if there was none.
+        finish_reason: why the answer ended, as the provider names it.
+        code: the answer without fences; empty if there was none.
         cached: whether the answer was kept from earlier.
-        prompt_tokens: tokens of the question, as counted when it was asked.
+        prompt_tokens: tokens of the question, as counted when it was asked; None if unknown.
         completion_tokens: tokens of the answer, likewise.
         cost_usd: its price, None if unknown.
         error: what went wrong with the answer or its program, None if nothing did.
@@ -105,9 +117,21 @@ class Call:
     query: str
     context: str
     model: str
+    repair: int = 0
+    messages: Sequence[Message] = ()
+    stop: Sequence[str] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    reply: str | None = None
+    finish_reason: str = ""
     code: str = ""
     cached: bool = False
-    prompt_tokens: int = 0
-    completion_tokens: int = 0
+    prompt_tokens: int | None = None
+    completion_tokens: int | None = None
     cost_usd: float | None = None
     error: str | None = None
+
+    def note(self, reply: Reply) -> None:
+        """Record what was answered."""
+        self.reply, self.finish_reason, self.cached = reply.text, reply.finish_reason, reply.cached
+        self.prompt_tokens, self.completion_tokens = reply.prompt_tokens, reply.completion_tokens
+        self.cost_usd = reply.cost_usd

@@ -6,8 +6,10 @@ holds.
 
 from __future__ import annotations
 
+import functools
 import re
 import textwrap
+from collections.abc import Sequence
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -25,6 +27,8 @@ _TASK = """Queries are for `{name}`. Each is answered by a short program in the 
 Answer every query I send next with the program for it, and nothing else: no imports, no prose (comments are welcome), \
 and not the query again. Use what the examples use, in the same way. Coordinates: x runs from back to front, y from \
 left to right, z from bottom to top."""
+_REPAIR = """That program cannot be used: {error}
+Answer the same query again with the whole corrected program, and nothing else."""
 _READY = "Understood. Send me a query and I answer with its program."
 
 
@@ -32,9 +36,27 @@ def chat_messages(config: LmpConfig, prompt: str, context: str, query: str) -> l
     """The request for a query: the examples first, then the query with its context line."""
     return [
         {"role": "system", "content": _SYSTEM},
-        {"role": "user", "content": _TASK.format(name=config.name, prompt=prompt)},
+        {"role": "user", "content": _task(config.name, prompt)},
         {"role": "assistant", "content": _READY},
         {"role": "user", "content": lines(context, query_line(config, query))},
+    ]
+
+
+@functools.lru_cache(maxsize=64)
+def _task(name: str, prompt: str) -> str:
+    """The first message; one object for all questions, because traces keep their messages."""
+    return _TASK.format(name=name, prompt=prompt)
+
+
+def repair_messages(
+    config: LmpConfig, asked: Sequence[Message], reply: str, error: str, context: str, query: str
+) -> list[Message]:
+    """A second request for a query: the first one, its answer, what was wrong with that, and the query again."""
+    said = _REPAIR.format(error=" ".join(error.split()))
+    return [
+        *asked,
+        {"role": "assistant", "content": reply},
+        {"role": "user", "content": lines(said, context, query_line(config, query))},
     ]
 
 

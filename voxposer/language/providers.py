@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import difflib
 import email.utils
 import functools
 import importlib
@@ -19,15 +20,13 @@ from typing import Any
 
 from vecenv.errors import MissingDependency
 
-# Names of litellm's exceptions that another attempt may not meet again.
-TRANSIENT = (
-    "RateLimitError",
-    "Timeout",
-    "APIConnectionError",
-    "InternalServerError",
-    "BadGatewayError",
-    "ServiceUnavailableError",
-)
+# Names of litellm's exceptions that another attempt may not meet again, whatever their status.
+_PASSING = ("RateLimitError", "Timeout", "APIConnectionError", "InternalServerError", "BadGatewayError")
+# HTTP statuses likewise, besides all from 500 on; and those that every request of the run will meet: no or a wrong
+# key, no credit, no rights, no such model or address.
+_PASSING_STATUS, _PERMANENT_STATUS = frozenset({408, 425, 429}), frozenset({401, 402, 403, 404})
+# What providers call a 429 that no waiting ends.
+_NO_CREDIT = re.compile(r"insufficient_quota|current quota|billing|credit balance|insufficient (credit|balance|fund)")
 _CLASSES = re.compile(r"^(litellm\.)?(\w+Error: |Timeout: |Timeout Error: )*(\w+Exception - )?(error - )?")
 
 
@@ -73,6 +72,39 @@ def _environment(**values: str) -> Iterator[None]:
     finally:
         for name in missing:
             os.environ.pop(name, None)
+
+
+def is_permanent(error: BaseException) -> bool:
+    """Whether every other request would meet this error of litellm too: the key, the account, or the model is wrong."""
+    if "LLM Provider NOT provided" in str(error):
+        return True
+    status = getattr(error, "status_code", None)
+    if status == 429:
+        return bool(_NO_CREDIT.search(f"{getattr(error, 'body', '')} {error}".lower()))
+    return status in _PERMANENT_STATUS
+
+
+def may_pass(error: BaseException) -> bool:
+    """Whether another attempt may not meet this error of litellm again."""
+    if is_permanent(error):
+        return False
+    status = getattr(error, "status_code", None) or 0
+    kinds = tuple(getattr(litellm(), name) for name in _PASSING)
+    return isinstance(error, kinds) or status in _PASSING_STATUS or status >= 500
+
+
+def lacks_key(model: str) -> bool:
+    """Whether the variable with the key of the model's provider is not set."""
+    return bool(litellm().validate_environment(model)["missing_keys"])
+
+
+def reason(error: Exception, model: str) -> str:
+    """What went wrong, in one line that begins with the kind of the error."""
+    if "LLM Provider NOT provided" in str(error):
+        close = difflib.get_close_matches(model, litellm().model_list, n=1)
+        hint = f"; did you mean {close[0]}?" if close else "; write PROVIDER/MODEL, such as openai/gpt-4o"
+        return f"{type(error).__name__}: litellm knows no provider of this model{hint}"
+    return f"{type(error).__name__}: {first_line(error)}"
 
 
 def price(response: object, model: str) -> float | None:

@@ -73,7 +73,7 @@ def _decoded(text: str) -> Reply | None:
         reply = Reply(**json.loads(text))
     except (ValueError, TypeError):
         return None
-    numbers = (reply.prompt_tokens, reply.completion_tokens, reply.cost_usd or 0.0)
+    numbers = (reply.prompt_tokens or 0, reply.completion_tokens or 0, reply.cost_usd or 0.0)
     words = (reply.text, reply.model, reply.finish_reason)
     sound = all(isinstance(word, str) for word in words) and all(isinstance(number, (int, float)) for number in numbers)
     return reply if sound and reply.text else None

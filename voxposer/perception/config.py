@@ -12,6 +12,7 @@ import numpy as np
 
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.world import Margins
+from voxposer.perception.grid import LEAST_MAP_SIZE, MAP_SIZE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,7 @@ class PerceptionConfig:
         above: height of the hand over an object when it has nothing to put down.
         edge: distance from the border of a place that the centre of what is put there keeps.
         home_reach: distance of the hand before the robot's base when an episode begins.
+        map_size: voxels along each axis of the maps.
     """
 
     margins: Margins = field(default_factory=lambda: Margins(gripper=Gripper(wrist=0.14), grasp_tilts=(0.3, 0.6)))
@@ -53,6 +55,11 @@ class PerceptionConfig:
     above: float = 0.10
     edge: float = 0.03
     home_reach: float = 0.45
+    map_size: int = MAP_SIZE
+
+    def __post_init__(self) -> None:
+        if self.map_size < LEAST_MAP_SIZE:
+            raise ValueError(f"map_size must be at least {LEAST_MAP_SIZE}, not {self.map_size}")
 
 
 @dataclass(frozen=True)

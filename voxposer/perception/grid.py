@@ -8,7 +8,9 @@ import numpy as np
 
 from voxposer.planning import maps
 
-MAP_SIZE = 100
+# Voxels along each axis, upstream's; and the fewest with which a path has neighbours to go to
+# (``voxposer.planning.config.reach``).
+MAP_SIZE, LEAST_MAP_SIZE = 100, 50
 
 
 @dataclass(frozen=True)

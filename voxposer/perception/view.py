@@ -62,7 +62,7 @@ class Perception:
     ) -> None:
         freeze(snapshot)
         self.snapshot, self.hand, self.config = snapshot, hand, config
-        self.grid = VoxelGrid(snapshot.workspace[0], snapshot.workspace[1])
+        self.grid = VoxelGrid(snapshot.workspace[0], snapshot.workspace[1], config.map_size)
         self.base = np.array([hand.home[0] - config.home_reach, hand.home[1], 0.0])
         self.scene = SceneGeometry(snapshot, config.margins, self.base[:2])
         self.grasp_finder = GraspFinder(self.scene, config, self.base, failed or {})

@@ -67,7 +67,7 @@ def given_settings(options: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that were given as options, by field name."""
     hints = typing.get_type_hints(EvalConfig)
     return {
-        each.name: _pairs(option_name(each), value) if _holds(hints[each.name], Mapping) else value
+        each.name: pairs(option_name(each), value) if _holds(hints[each.name], Mapping) else value
         for each in fields(EvalConfig)
         if (value := options.get(each.name)) not in (None, [])
     }
@@ -159,14 +159,22 @@ def _holds(hint: Any, kind: type) -> bool:
     return isinstance(origin, type) and issubclass(origin, kind)
 
 
-def _pairs(flag: str, texts: Sequence[str]) -> dict[str, Any]:
-    """``["a=1", "b=x"]`` as ``{"a": 1, "b": "x"}``: values are read as JSON where they are JSON, else kept as text."""
-    pairs = {}
+def pairs(flag: str, texts: Sequence[str]) -> dict[str, Any]:
+    """``["a=1", "b.c=x"]`` as ``{"a": 1, "b": {"c": "x"}}``: values are JSON where they can be read so, else text."""
+    pairs: dict[str, Any] = {}
     for text in texts:
         key, equals, value = text.partition("=")
-        if not (equals and key.isidentifier()):
+        *above, last = key.split(".")
+        if not (equals and all(part.isidentifier() for part in (*above, last))):
             fail(f"{flag} {text!r}: write key=value")
-        pairs[key] = _value(value)
+        here = pairs
+        for part in above:
+            here = here.setdefault(part, {})
+            if not isinstance(here, dict):
+                fail(f"{flag} {text!r}: {part} was given a value of its own")
+        if (above and last in here) or isinstance(here.get(last), dict):
+            fail(f"{flag} {text!r}: {key} is given twice")
+        here[last] = _value(value)
     return pairs
 
 

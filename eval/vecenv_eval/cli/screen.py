@@ -225,7 +225,7 @@ class _Lines:
 def _about(now: Progress, rates: Rates) -> str:
     """The stream that runs, what went wrong so far, and the speed."""
     stream = f"stream {now.batch + 1}/{now.num_batches}"
-    problems = [f"{count} {what}" for count, what in ((now.faults, "faulted"), (now.errors, "failed")) if count]
+    problems = [f"{count} {what}" for count, what in ((now.faults, "faulted"), (now.errors, "in error")) if count]
     if now.setting_up:
         return ", ".join([f"{stream}: setting up", *problems])
     speed = [] if rates.episodes_per_s is None else [f"{rates.episodes_per_s:.3g} episodes/s"]

@@ -25,7 +25,7 @@ from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.episodes import Episode, Suite
 from vecenv_eval.loop import EpisodeLoop, make_streams
 from vecenv_eval.memory import choose_slots
-from vecenv_eval.policies import Closing, Policy, make_policy
+from vecenv_eval.policies import Closing, Policy, PolicyUnavailable, make_policy
 from vecenv_eval.results import Progress
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.store import Record
@@ -91,7 +91,7 @@ class Report:
         files: path in the results folder -> content, of videos.
         error: a traceback for ``errors.log``.
         conditions: what the episodes run under.
-        refused: why the environment refuses the config.
+        refused: why the environment refuses the config, or the policy can act in no episode.
         steps: control ticks that the actor has executed, None when that is not reported.
     """
 
@@ -204,7 +204,7 @@ class EpisodeActor:
         sys.path += [folder for folder in self._path if folder not in sys.path]
         self._given: Assignment = pickle.loads(self._pickled)
         given = self._given
-        policy = make_policy(given.config.policy_name, seed=given.policy_seed, **given.config.policy_args)
+        policy = make_policy(given.config.policy_name, given.config.policy_args, seed=given.policy_seed)
         self._policy = policy
         self._loop = EpisodeLoop(
             given.config,
@@ -231,7 +231,7 @@ class EpisodeActor:
                 self._loop.run_stream(number, stream)
         except _Stopped:
             pass
-        except ConfigError as error:
+        except (ConfigError, PolicyUnavailable) as error:
             self._outbox.reports.put(Report(refused=str(error)))
         finally:
             self._outbox.reports.put(Report(steps=self._steps))

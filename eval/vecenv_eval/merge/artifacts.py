@@ -1,17 +1,18 @@
-"""What runs recorded beside their rows, copied from the folders that are merged: demonstrations, videos, datasets.
+"""What runs recorded beside their rows, copied from the folders that are merged.
 
-Only what belongs to a row that is taken over is copied. Files are replaced in one step: a copy is whole or not there.
+That is demonstrations, videos, policies' logs and datasets. Only what belongs to a row that is taken over is copied.
+Files are replaced in one step: a copy is whole or not there.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from vecenv_eval.episodes import Episode
 from vecenv_eval.merge.sources import Source
-from vecenv_eval.store import ERRORS, ResultStore
+from vecenv_eval.store import ERRORS, ResultStore, log_path
 from vecenv_eval.video.episodes import video_path
 
 
@@ -30,7 +31,8 @@ def copy_artifacts(store: ResultStore, episodes: Mapping[Episode, Source]) -> No
     for source in sources.values():
         own = [key for key, other in episodes.items() if other is source]
         _copy_demos(store, source.store, own)
-        _copy_videos(store.folder, source.folder, own)
+        _copy_files(store.folder, source.folder, own, video_path)
+        _copy_files(store.folder, source.folder, own, log_path)
         _copy_dataset(store.folder, source.folder, own)
         if (source.folder / ERRORS).is_file():
             _copy(source.folder / ERRORS, store.folder / f"errors-{source.id[:8]}.log")
@@ -49,10 +51,11 @@ def _copy_demos(store: ResultStore, source: ResultStore, keys: Sequence[Episode]
         copy_demos(source.demos_path(*key), store.demos_path(*key), episodes)
 
 
-def _copy_videos(target: Path, source: Path, keys: Sequence[Episode]) -> None:
+def _copy_files(target: Path, source: Path, keys: Sequence[Episode], path_of: Callable[[Path, Episode], Path]) -> None:
+    """Copy the file of each episode, where it has one."""
     for key in keys:
-        if (path := video_path(source, key)).is_file():
-            _copy(path, video_path(target, key))
+        if (path := path_of(source, key)).is_file():
+            _copy(path, path_of(target, key))
 
 
 def _copy_dataset(target: Path, source: Path, keys: Sequence[Episode]) -> None:

@@ -17,7 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control, ResetInfo
-from vecenv.errors import InvalidInput
+from vecenv.errors import InvalidInput, ServiceError
 
 BUILTIN = {
     "gr00t": "vecenv_eval.clients.gr00t:Gr00tPolicy",
@@ -34,6 +34,14 @@ BUILTIN = {
 
 class PolicyError(InvalidInput):
     """A policy cannot be made: unknown name, a module that does not import, or arguments it does not take."""
+
+
+class PolicyUnavailable(ServiceError):
+    """A policy can act in no episode of the run, whatever is tried: the run ends at once.
+
+    Its ``act`` raises this, for a key that is wrong or a model that does not exist. The episodes that were running end
+    in an error with the message, and no other begins.
+    """
 
 
 @runtime_checkable
@@ -79,6 +87,30 @@ class Reporting(Protocol):
 
 
 @runtime_checkable
+class Failing(Protocol):
+    """A policy that may be unable to act in single episodes, while the others go on; optional.
+
+    It ends such an episode with ``env.end_episodes``.
+    """
+
+    def episode_error(self, slot: int) -> str:
+        """Why the episode in a slot, which has just finished, has no verdict; "" when it has one.
+
+        The episode is recorded as an error with this cause, not as a failure, and runs again.
+        """
+        ...
+
+
+@runtime_checkable
+class Logging(Protocol):
+    """A policy that keeps a log of each episode, which is stored with the results; optional."""
+
+    def episode_log(self, slot: int) -> Sequence[Mapping[str, Any]]:
+        """Objects for JSON about the episode in a slot so far; written to ``DIR/policy_logs``, one a line."""
+        ...
+
+
+@runtime_checkable
 class Refillable(Protocol):
     """A policy whose slots may begin new episodes one by one; optional.
 
@@ -120,19 +152,25 @@ def extras_of(policy: Policy, slot: int) -> dict[str, Any]:
     return dict(policy.extras(slot)) if isinstance(policy, Reporting) else {}
 
 
-def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
+def error_of(policy: Policy, slot: int) -> str:
+    """Why the episode in a slot has no verdict; "" when it has one."""
+    return policy.episode_error(slot) if isinstance(policy, Failing) else ""
+
+
+def make_policy(name: str, given: Mapping[str, Any] | None = None, /, *, seed: int = 0, **arguments: Any) -> Policy:
     """Make the policy called ``name``.
 
     Args:
         name: one of ``BUILTIN``, or ``"module:Class"``.
-        seed: passed on to policies whose constructor takes a ``seed`` (unless ``arguments`` already has one).
-        **arguments: constructor arguments.
+        given: constructor arguments, a ``seed`` among them if the policy is to have one of its own.
+        seed: passed on to policies whose constructor takes a ``seed`` (unless ``given`` already has one).
+        **arguments: further constructor arguments.
 
     Raises:
         PolicyError: the name is unknown, its module does not import, it does not take the arguments, or it raises an
             exception.
     """
-    factory = _bound(name, seed, arguments)
+    factory = _bound(name, seed, {**(given or {}), **arguments})
     try:
         policy = factory()
     except PolicyError:
@@ -144,7 +182,7 @@ def make_policy(name: str, *, seed: int = 0, **arguments: Any) -> Policy:
     return policy
 
 
-def check_policy(name: str, **arguments: Any) -> None:
+def check_policy(name: str, arguments: Mapping[str, Any]) -> None:
     """Raise what ``make_policy`` raises before it makes the policy, which may be a large model."""
     _bound(name, 0, arguments)
 

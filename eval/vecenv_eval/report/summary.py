@@ -19,6 +19,8 @@ from vecenv_eval.store import Record
 
 CONFIDENCE = 0.95
 TOTAL = "all"
+# A value that a policy reports as None.
+UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,7 @@ class Summary:
         wall_s: seconds spent running episodes, the policy's included.
         steps_per_s: ``steps / wall_s``.
         extras: what the policy reported (``Record.extras``), by name: the mean an episode of what is a number, how
-            often each text was reported.
+            often each text was reported, and how often a value was reported as unknown.
         stand_ins: how many episodes ran with what in place of a missing file.
         conditions: what the episodes ran under, see ``vecenv_eval.conditions``; empty when no environment was made.
         parts: the intermediate results of the success check, task by task; SIMPLER's tasks have some.
@@ -197,13 +199,16 @@ def _row(task: int | str, instruction: str, records: Sequence[Record], planned: 
 
 
 def _extras(records: Sequence[Record]) -> dict[str, float | dict[str, int]]:
-    """Means of reported numbers, counts of reported words (empty ones left out)."""
+    """Means of reported numbers, counts of reported words (empty ones left out) and of values that are not known."""
     result: dict[str, float | dict[str, int]] = {}
     for name in dict.fromkeys(name for record in records for name in record.extras):
         values = [record.extras[name] for record in records if record.extras.get(name) not in (None, "")]
         numbers = [float(value) for value in values if isinstance(value, int | float)]
         words = Counter(str(value) for value in values if not isinstance(value, int | float))
+        unknown = sum(name in record.extras and record.extras[name] is None for record in records)
         result[name] = dict(words.most_common()) if words else sum(numbers) / len(numbers) if numbers else {}
+        if unknown:
+            result[f"{name} ({UNKNOWN})" if values else name] = {UNKNOWN: unknown}
     return result
 
 

@@ -6,6 +6,7 @@ database (``rows``, ``jsonl``, ``sqlite``); whoever reads a folder does not need
 
 from vecenv_eval.store.folder import CONFIG, DEMOS, ERRORS, REPORT, RESULTS, SUMMARY, ResultStore, default_folder
 from vecenv_eval.store.jsonl import EPISODES
+from vecenv_eval.store.logs import LOGS, log_path, write_log
 from vecenv_eval.store.record import CIRCUMSTANCES, Record, StoreError, StoreWriteError
 from vecenv_eval.store.rows import STORES
 from vecenv_eval.store.sqlite import DATABASE
@@ -17,6 +18,7 @@ __all__ = [
     "DEMOS",
     "EPISODES",
     "ERRORS",
+    "LOGS",
     "REPORT",
     "RESULTS",
     "STORES",
@@ -26,4 +28,6 @@ __all__ = [
     "StoreError",
     "StoreWriteError",
     "default_folder",
+    "log_path",
+    "write_log",
 ]

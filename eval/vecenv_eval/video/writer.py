@@ -131,6 +131,8 @@ def recording(
     cameras: Sequence[str] = ("agentview",),
     columns: int | None = None,
     fps: float = CONTROL_HZ,
+    titles: Sequence[str] | None = None,
+    judged: bool = True,
 ) -> Iterator[VideoWriter]:
     """Record all slots in one video inside the context, one frame per control step, with titles.
 
@@ -143,15 +145,18 @@ def recording(
         cameras: shown side by side; SIMPLER has ``agentview`` alone.
         columns: slots in a row.
         fps: frames per second; at the robot's control rate the video runs as fast as the robot.
+        titles: of the slots, in place of the episodes' names and instructions.
+        judged: whether slots are framed by their verdict.
     """
     info = env.reset()
-    titles = [f"{name}: {text}" for name, text in zip(info.episode_id, info.instruction, strict=True)]
+    if titles is None:
+        titles = [f"{name}: {text}" for name, text in zip(info.episode_id, info.instruction, strict=True)]
 
     def add_frame(failed: bool | None = None) -> None:
         seen, solved = env.observe_egocentric(), env.evaluate().success
         if isinstance(seen.images, Rendered):
             seen.images.prepare(*cameras)
-        verdicts = [True if one else failed for one in solved.tolist()]
+        verdicts = [True if one else failed for one in solved.tolist()] if judged else []
         video.add(render_grid([seen.images[name] for name in cameras], titles, columns=columns, verdicts=verdicts))
 
     with VideoWriter(path, fps) as video:
