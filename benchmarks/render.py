@@ -1,16 +1,24 @@
-"""Physics and two 256 x 256 images every control step: vecenv against upstream's SubprocVectorEnv at equal cores.
+"""Physics and two 256 x 256 images every control step: vecenv against upstream's SubprocVectorEnv on the same machine.
 
-Upstream runs one process a core, each an ``OffScreenRenderEnv``; vecenv runs one process with as many threads, once
-with upstream's image (``lod="exact"``) and once with simplified meshes (``"fast"``). All draw in the same software GL
-and take the same random actions. The three sides take turns within one run, a few control steps each, so other load
-on the machine affects all of them; rates are environment control steps a second, medians over the turns, and ratios are
-medians of the turns' ratios. ``psnr`` and ``ssim`` compare ``"fast"`` with ``"exact"``, the worst image of the run.
+Upstream runs one process for each of its environments, each an ``OffScreenRenderEnv``: as many as there are cores, or,
+with ``--processes slots``, as many as vecenv has slots. vecenv runs one process with as many threads as there are
+cores, once with upstream's image (``lod="exact"``) and once with simplified meshes (``"fast"``); with ``--physics``
+also without images, against upstream's environments without a renderer. All draw with the same GL (``MUJOCO_GL``:
+software on a CPU, the GPU's with ``egl`` where there is one) and take the same random actions. The sides take turns
+within one run, a few control steps each, so other load on the machine affects all of them; rates are environment
+control steps a second, medians over the turns, and ratios are medians of the turns' ratios. ``psnr`` and ``ssim``
+compare ``"fast"`` with ``"exact"``, the worst image of the run.
+
+    python benchmarks/render.py
+    MUJOCO_GL=egl python benchmarks/render.py --scenes libero_object/0 --slots 1 16 64 --processes slots --physics
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
+import itertools
+import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -24,45 +32,54 @@ from support.images import psnr, ssim
 
 import vecenv
 from vecenv.libero.render.options import RenderConfig
-from vecenv.libero.tasks.suites import list_tasks
+from vecenv.libero.tasks.suites import NUM_EPISODES, list_tasks
 from vecenv.util.cores import usable_cores
 
 TASKS = [("libero_object", 0), ("libero_spatial", 0), ("libero_10", 0)]
 SIZE = 256
 
 
-def upstream_batch(suite: str, task: int, workers: int) -> Callable[[np.ndarray], None]:
+def upstream_batch(suite: str, task: int, workers: int, *, images: bool = True) -> Callable[[np.ndarray], None]:
     """Upstream's vector environment, live; stepping takes actions [workers, 7]."""
     from support import upstream
 
-    upstream._classes()
+    bare, _ = upstream._classes()
     with upstream.silence():
         from libero.libero.envs import OffScreenRenderEnv, SubprocVectorEnv
     spec = list_tasks(suite)[task]
-    make = functools.partial(
-        OffScreenRenderEnv, bddl_file_name=str(spec.bddl_path), camera_heights=SIZE, camera_widths=SIZE
+    blind = {"use_camera_obs": False, "has_renderer": False, "has_offscreen_renderer": False}
+    make = (
+        functools.partial(
+            OffScreenRenderEnv, bddl_file_name=str(spec.bddl_path), camera_heights=SIZE, camera_widths=SIZE
+        )
+        if images
+        else functools.partial(bare, bddl_file_name=str(spec.bddl_path), **blind)
     )
     env = SubprocVectorEnv([make] * workers)  # pyright: ignore[reportArgumentType]
     with upstream.silence():
         env.reset()
-        env.set_init_state(list(spec.init_states()[:workers]))
+        env.set_init_state([spec.init_states()[worker % NUM_EPISODES] for worker in range(workers)])
 
     def step(actions: np.ndarray) -> None:
         observations, *_ = env.step(actions)
-        assert observations[0]["agentview_image"].shape == (SIZE, SIZE, 3)
+        assert not images or observations[0]["agentview_image"].shape == (SIZE, SIZE, 3)
 
     step.close = env.close  # pyright: ignore[reportFunctionMemberAccess]
     return step
 
 
-def our_batch(suite: str, task: int, slots: int, lod: str) -> tuple[Any, Callable[[np.ndarray], list[np.ndarray]]]:
-    """A live batch; stepping takes actions [slots, 7] and gives the two images of every slot."""
-    env = vecenv.make(suite, task=task, episodes=range(slots), render=RenderConfig(lod=lod, height=SIZE, width=SIZE))
+def our_batch(
+    suite: str, task: int, slots: int, lod: str | None
+) -> tuple[Any, Callable[[np.ndarray], list[np.ndarray] | None]]:
+    """A live batch; stepping takes actions [slots, 7] and gives the two images of every slot, none without ``lod``."""
+    episodes = [slot % NUM_EPISODES for slot in range(slots)]
+    render = None if lod is None else RenderConfig(lod=lod, height=SIZE, width=SIZE)
+    env = vecenv.make(suite, task=task, episodes=episodes, render=render)
     env.reset()
 
-    def step(actions: np.ndarray) -> list[np.ndarray]:
+    def step(actions: np.ndarray) -> list[np.ndarray] | None:
         env.step_continuous(actions)
-        return env.observe_egocentric().observation
+        return None if lod is None else env.observe_egocentric().observation
 
     return env, step
 
@@ -76,17 +93,20 @@ def rate(step: Callable[[np.ndarray], Any], slots: int, ticks: int, rng: np.rand
     return slots * ticks / (time.perf_counter() - begun), last
 
 
-def compare(suite: str, task: int, turns: int, ticks: int, slots: int) -> dict[str, Any]:
-    cores = usable_cores()
-    theirs = upstream_batch(suite, task, cores)
+def compare(suite: str, task: int, slots: int, processes: int, turns: int, ticks: int, physics: bool) -> dict[str, Any]:
+    """One scene with so many slots, and so many processes of upstream's."""
+    theirs = {"upstream": upstream_batch(suite, task, processes)}
     ours = {lod: our_batch(suite, task, slots, lod) for lod in ("exact", "fast")}
-    rates: dict[str, list[float]] = {"upstream": [], "exact": [], "fast": []}
+    if physics:
+        theirs["upstream, physics"] = upstream_batch(suite, task, processes, images=False)
+        ours["physics"] = our_batch(suite, task, slots, None)
+    rates: dict[str, list[float]] = {name: [] for name in (*theirs, *ours)}
     worst = [np.inf, np.inf]
     for turn in range(turns + 1):  # the first warms up
-        found = {"upstream": rate(theirs, cores, ticks, np.random.default_rng(turn))[0]}
+        found = {name: rate(step, processes, ticks, np.random.default_rng(turn))[0] for name, step in theirs.items()}
         images = {}
-        for lod, (_, step) in ours.items():
-            found[lod], images[lod] = rate(step, slots, ticks, np.random.default_rng(turn))
+        for name, (_, step) in ours.items():
+            found[name], images[name] = rate(step, slots, ticks, np.random.default_rng(turn))
         for exact, fast in zip(*(np.concatenate(images[lod]) for lod in ("exact", "fast")), strict=True):
             worst = [min(worst[0], psnr(exact, fast)), min(worst[1], ssim(exact, fast))]
         if turn:
@@ -94,10 +114,15 @@ def compare(suite: str, task: int, turns: int, ticks: int, slots: int) -> dict[s
                 rates[name].append(value)
     for env, _ in ours.values():
         env.close()
-    theirs.close()  # pyright: ignore[reportFunctionMemberAccess]
+    for step in theirs.values():
+        step.close()  # pyright: ignore[reportFunctionMemberAccess]
+    blind = {"physics / upstream": round(_ratio(rates["physics"], rates["upstream, physics"]), 2)} if physics else {}
     return {
         "scene": f"{suite} {task}",
+        "slots": slots,
+        "upstream processes": processes,
         **{f"{lod} / upstream": round(_ratio(rates[lod], rates["upstream"]), 2) for lod in ("exact", "fast")},
+        **blind,
         **{name: round(median(values), 1) for name, values in rates.items()},
         "psnr": round(worst[0], 1),
         "ssim": round(worst[1], 3),
@@ -113,20 +138,25 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", default=[f"{suite}/{task}" for suite, task in TASKS])
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--ticks", type=int, default=4, help="control steps of a turn")
-    parser.add_argument("--slots", type=int, default=8, help="slots of vecenv's batch")
+    parser.add_argument("--slots", type=int, nargs="+", default=[8], help="slots of vecenv's batch")
+    parser.add_argument("--processes", choices=("cores", "slots"), default="cores", help="processes of upstream's")
+    parser.add_argument("--physics", action="store_true", help="also without images")
+    parser.add_argument("--name", default="render", help="name of the results file")
     given = parser.parse_args()
     rows = []
-    # A process a scene: upstream forks its workers, and a fork of a process that has drawn before hangs.
+    # A process a row: upstream forks its workers, and a fork of a process that has drawn before hangs.
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as apart:
-        for scene in given.scenes:
+        for scene, slots in itertools.product(given.scenes, given.slots):
             suite, task = scene.split("/")
-            rows.append(apart.submit(compare, suite, int(task), given.turns, given.ticks, given.slots).result())
+            processes = usable_cores() if given.processes == "cores" else slots
+            settings = (slots, processes, given.turns, given.ticks, given.physics)
+            rows.append(apart.submit(compare, suite, int(task), *settings).result())
             print(rows[-1], flush=True)
     report(
-        "render",
+        given.name,
         rows,
         title=f"control steps a second with two {SIZE} x {SIZE} images, {usable_cores()} cores",
-        notes={"upstream_processes": usable_cores(), "slots": given.slots, "turns": given.turns, "ticks": given.ticks},
+        notes={"GL": os.environ.get("MUJOCO_GL", "usual"), "turns": given.turns, "ticks": given.ticks},
     )
 
 
