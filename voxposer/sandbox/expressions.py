@@ -134,7 +134,7 @@ class Expressions:
             return ErrorType(ERRORS[name])
         known = [*scope.variables, *scope.program.variables, *self._functions, *vocabulary.BUILTINS]
         near = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else vocabulary.HINTS.get(name, "")
+        hint = vocabulary.HINTS.get(name) or (f"; did you mean {near[0]!r}?" if near else "")
         raise Refusal("names", f"{name[:80]!r} is not known{hint}")
 
     def _attribute(self, node: ast.Attribute, scope: Scope) -> Any:
@@ -420,7 +420,7 @@ class Expressions:
         """An argument of a given function: data alone, no more of it than a program may print or keep."""
         weight = self._guard.weigh(value)
         self._guard.characters(weight.characters)
-        wrong = weight.kinds & {"function", "iterator", "error", "class of errors"}
+        wrong = weight.kinds & {"function", "iterator", "error", "class of errors", "type"}
         if wrong:
             raise Refusal("types", f"{name}() takes values, not a {sorted(wrong)[0]}; give what it returns")
         if isinstance(value, (range, set)):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from voxposer.sandbox.guard import Guard, Opaque, Record, RecordList, Refusal, kind_of, refuse_kind
-from voxposer.sandbox.objects import Error, ErrorType, Function, Stream
+from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Stream, TypeName
 
 # Numbers in one piece of text.
 _PRINTED = 1000
@@ -186,7 +186,7 @@ def _plain(guard: Guard, value: object) -> Any:
         return guard.host("the observation", str, value)
     if isinstance(value, Error):
         return _Shown(value.text)
-    if isinstance(value, (RecordList, Opaque, Function, Stream, ErrorType)):
+    if isinstance(value, (RecordList, Opaque, Function, Stream, ErrorType, DType, TypeName)):
         refuse_kind(value, "something with a text")
     return value
 

@@ -354,12 +354,14 @@ _KINDS: dict[type, str] = {
     Stream: "iterator",
     Error: "error",
     ErrorType: "class of errors",
+    DType: "type",
+    TypeName: "type",
 }
 
 
 def kind_of(value: object) -> str:
     """The kind of a value: number, array, text, list, tuple, dictionary, set, range, observation, map, function, iterator,
-    error, class of errors, None.
+    error, class of errors, type, None.
 
     Raises:
         Refusal: programs may not hold it.
@@ -375,8 +377,6 @@ def kind_of(value: object) -> str:
             return name
     if isinstance(value, Module):
         raise Refusal("functions", f"{value.name} is a module: its functions can be called, but it is no value")
-    if isinstance(value, (DType, TypeName)):
-        raise Refusal("values", f"{value.name} is a type: it can be a dtype argument or be called, but is not a value")
     raise Refusal("values", f"{type(value).__name__} is not a kind of value that a program may hold")
 
 

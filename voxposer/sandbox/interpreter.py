@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from voxposer.sandbox.guard import Budget, Guard, Limits
-from voxposer.sandbox.objects import DType, Function, Module, Stream
+from voxposer.sandbox.objects import Function, Module, Stream
 from voxposer.sandbox.scopes import Scope
 from voxposer.sandbox.statements import Returned, Statements
 from voxposer.sandbox.syntax import checked_tree, reads
@@ -90,7 +90,7 @@ class Program:
 
 
 # Values that mean nothing outside the run that made them.
-_OF_A_RUN = (Function, Stream, Module, DType)
+_OF_A_RUN = (Function, Stream, Module)
 
 
 def parse(source: str, *, limits: Limits = Limits()) -> Program:  # noqa: B008  (frozen)

@@ -13,7 +13,7 @@ import numpy as np
 
 from voxposer.sandbox.guard import Guard, Refusal, kind_of, refuse_kind
 from voxposer.sandbox.objects import DType, Function, Stream
-from voxposer.sandbox.values import integer, iterate, listed, number_of, truth
+from voxposer.sandbox.values import integer, iterate, listed, single_number, truth
 
 _NOTHING = object()
 
@@ -61,8 +61,8 @@ def _not_callable(value: object) -> Any:
 
 
 _CONVERSIONS: dict[str, Callable[..., Any]] = {
-    "int": lambda value: int(number_of(value)),
-    "float": lambda value: float(number_of(value)),
+    "int": lambda value: int(single_number(value)),
+    "float": lambda value: float(single_number(value)),
     "bool": lambda value: bool(value),
 }
 

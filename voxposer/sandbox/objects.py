@@ -77,7 +77,7 @@ class Module:
 
 
 class DType:
-    """A number type such as ``int`` in ``x.astype(int)``: allowed as an argument, not as a value."""
+    """A number type, such as ``int`` in ``x.astype(int)`` and in ``int(x)``."""
 
     def __init__(self, name: str, dtype: type[np.generic]) -> None:
         self.name, self.dtype = name, dtype

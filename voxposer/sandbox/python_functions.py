@@ -30,6 +30,7 @@ from voxposer.sandbox.values import (
     listed,
     number_of,
     numbers,
+    single_number,
     truth,
 )
 
@@ -126,13 +127,6 @@ def converted(guard: Guard, dtype: DType, *values: object) -> Any:
 
 
 _PLAIN: dict[str, Function] = {"int": to_int, "float": to_float, "bool": lambda guard, value=False: truth(guard, value)}
-
-
-def single_number(value: object) -> Any:
-    """A number, the only element of an array, or text that says a number."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        return value.item()
-    return value if kind_of(value) in ("number", "text") else refuse_kind(value, "a number")
 
 
 def make_range(guard: Guard, *ends: object) -> range:

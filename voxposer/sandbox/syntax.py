@@ -30,7 +30,7 @@ RULES: Mapping[str, str] = MappingProxyType(
         "attributes": "attributes are an observation's fields, or an array's shape, ndim, size and T, and only read",
         "functions": "modules are no values, and only functions are called",
         "values": "values are numbers, text, arrays of numbers, lists, tuples, dictionaries, sets, functions, iterators, "
-        "errors, observations and maps",
+        "errors, types, observations and maps",
         "types": "operators and functions get values they are made for",
         "value": "operations have a result",
         "call": "a given function did what it was asked",

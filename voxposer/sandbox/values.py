@@ -25,7 +25,7 @@ from voxposer.sandbox.guard import (
     refuse_kind,
     require_numbers,
 )
-from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Stream
+from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Stream, TypeName
 
 # Largest number of digits for round().
 _DIGITS = 20
@@ -124,6 +124,13 @@ def number_of(value: object) -> int | float:
     return value.item() if isinstance(value, np.generic) else cast(float, value)
 
 
+def single_number(value: object) -> Any:
+    """A number, the only element of an array, or text that says a number."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        return value.item()
+    return value if kind_of(value) in ("number", "text") else refuse_kind(value, "a number")
+
+
 def digits_of(value: object) -> int:
     """A number of digits, within bounds."""
     digits = integer(value)
@@ -149,7 +156,7 @@ def truth(guard: Guard, value: object) -> bool:
         raise Refusal("types", f"an array of {value.size} elements is neither true nor false; use .any() or .all()")
     if isinstance(value, RecordList):
         return length_of(guard, value) > 0
-    return True if isinstance(value, (Record, Opaque, Function, Stream, Error, ErrorType)) else bool(value)
+    return True if isinstance(value, (Record, Opaque, Function, Stream, Error, ErrorType, DType, TypeName)) else bool(value)
 
 
 def hashable(guard: Guard, key: object) -> Any:
