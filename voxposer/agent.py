@@ -32,7 +32,7 @@ from voxposer.perception.view import Perception
 from voxposer.planning import plan as plans
 from voxposer.planning.config import PlannerConfig
 from voxposer.planning.plan import PlanConfig, PlannedWaypoint, SubtaskPlan
-from voxposer.pushing import PushError, PushingConfig, PushSituation, PushTask
+from voxposer.pushing import PushError, PushingConfig, PushSituation
 from voxposer.quaternions import quaternion
 from voxposer.requests import InterfaceError, MotionRequest
 from voxposer.sandbox.guard import HostFault
@@ -240,7 +240,7 @@ class Agent:
             if isinstance(path, InterfaceError):
                 raise path
             if request.object_centric:
-                slot.enter(Pushing(PushTask(request.movable, perception.grid.world(path)), rest))
+                slot.enter(Pushing(pushing.task_of(request.movable, perception.grid.world(path), perception), rest))
                 return []
             stops = stops_of(request, path, perception, self.config.route, closed=slot.grip.closed)
         except InterfaceError as error:

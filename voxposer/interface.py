@@ -207,7 +207,11 @@ class Interface:
     def _require_pushable(self, name: str, targets: np.ndarray | None) -> None:
         if targets is None:
             raise InterfaceError(f"{name} is to move, but there is no affordance map with its target")
-        if name not in self.perception.snapshot.movable:
+        part = self.perception.snapshot.parts.get(name)
+        if part is not None and part.joint is not None:
+            if part.kind == "knob":
+                raise InterfaceError(f"{name} cannot be pushed: it is turned, so grasp it and turn the hand")
+        elif name not in self.perception.snapshot.movable:
             raise InterfaceError(f"{name} cannot be pushed: it is fixed")
 
     def _map(self, given: VoxelMap, what: str, *tail: int) -> np.ndarray:

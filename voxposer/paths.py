@@ -28,7 +28,10 @@ def plan_paths(
 ) -> list[np.ndarray | InterfaceError]:
     """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path."""
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
-    asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None]
+    for i, (interface, request) in enumerate(wants):
+        if hangs_on_joint(interface.perception, request):
+            paths[i] = np.stack([request.start, nearest_target(request)]).astype(float)
+    asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None and not len(paths[i])]
     for first in range(0, len(asking), CHUNK):
         chunk = asking[first : first + CHUNK]
         for i, path in zip(chunk, _planned([wants[i] for i in chunk], config, route), strict=True):
@@ -57,6 +60,17 @@ def _planned(
         else InterfaceError(f"no path to the targets: {Fault(int(fault[i])).name.lower().replace('_', ' ')}")
         for i in range(len(wants))
     ]
+
+
+def hangs_on_joint(perception: Perception, request: MotionRequest) -> bool:
+    """Whether a part is to be pushed: where it can go is up to its joint, so its path is not searched for."""
+    return request.object_centric and request.targets is not None and request.movable in perception.snapshot.parts
+
+
+def nearest_target(request: MotionRequest) -> np.ndarray:
+    """The target voxel that is nearest to the start of a motion, [3]."""
+    found = np.argwhere(request.targets)
+    return found[int(np.linalg.norm(found - request.start, axis=1).argmin())]
 
 
 def start_of(interface: Interface, request: MotionRequest) -> np.ndarray:

@@ -26,7 +26,7 @@ class MotionRequest:
     Attributes:
         kind: ``"path"`` (plan over maps), ``"stay"`` (no affordance: where the hand is) or ``"home"``.
         movable: name of what is to be moved.
-        object_centric: whether that is an object, to be pushed, and not the hand.
+        object_centric: whether that is an object, or a part that hangs on a joint, to be pushed, and not the hand.
         start: voxel from which to plan, [3].
         targets: bool [N, N, N]; None for ``stay`` and ``home``.
         avoidance: float32 [N, N, N] in 0..1, None without.
