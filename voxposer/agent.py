@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control, PlanControl
+from vecenv.errors import VecenvError
 from vecenv.manipulation.routes import RouteConfig, Stop
 from vecenv.manipulation.world import matrix
 from vecenv.observations import ObjectsSnapshot
@@ -32,7 +33,7 @@ from voxposer.perception.view import Perception
 from voxposer.planning import plan as plans
 from voxposer.planning.config import PlannerConfig
 from voxposer.planning.plan import PlanConfig, PlannedWaypoint, SubtaskPlan
-from voxposer.pushing import PushError, PushingConfig, PushSituation
+from voxposer.pushing import PushingConfig, PushSituation
 from voxposer.quaternions import quaternion
 from voxposer.requests import InterfaceError, MotionRequest
 from voxposer.sandbox.guard import HostFault
@@ -243,7 +244,7 @@ class Agent:
                 slot.enter(Pushing(pushing.task_of(request.movable, perception.grid.world(path), perception), rest))
                 return []
             stops = stops_of(request, path, perception, self.config.route, closed=slot.grip.closed)
-        except InterfaceError as error:
+        except VecenvError as error:
             _stop_with(slot, error)
             return []
         if request.kind == "path":
@@ -279,7 +280,7 @@ class Agent:
         assert isinstance(slot.phase, Pushing)
         try:
             return pushing.situation(slot.phase.task, slot.interface.perception, self.config.push)
-        except PushError as error:
+        except VecenvError as error:
             _stop_with(slot, error)
             return None
 

@@ -44,7 +44,7 @@ def _planned(
 ) -> list[np.ndarray | InterfaceError]:
     padded = [*wants, *[wants[-1]] * ((1 if len(wants) == 1 else CHUNK) - len(wants))]
     starts = np.stack([start_of(interface, request) for interface, request in padded])
-    obstacles = [obstacle_map(interface.perception, request, route) for interface, request in wants]
+    obstacles, refused = _obstacle_maps(wants, route)
     obstacles += [obstacles[-1]] * (len(padded) - len(wants))
     found = optimize_paths(
         starts,
@@ -55,11 +55,28 @@ def _planned(
     )
     lengths, path, fault = (np.asarray(x) for x in (found.path_length, found.path, found.fault))
     return [
-        path[i, : lengths[i]].astype(float)
+        refused[i]
+        if i in refused
+        else path[i, : lengths[i]].astype(float)
         if lengths[i]
         else InterfaceError(f"no path to the targets: {Fault(int(fault[i])).name.lower().replace('_', ' ')}")
         for i in range(len(wants))
     ]
+
+
+def _obstacle_maps(
+    wants: Sequence[tuple[Interface, MotionRequest]], route: RouteConfig
+) -> tuple[list[np.ndarray], dict[int, InterfaceError]]:
+    """The obstacle map of each request, and the errors of those that have none, by their number."""
+    made: list[np.ndarray] = []
+    refused: dict[int, InterfaceError] = {}
+    for i, (interface, request) in enumerate(wants):
+        try:
+            made.append(obstacle_map(interface.perception, request, route))
+        except InterfaceError as error:
+            refused[i] = error
+            made.append(np.zeros((interface.perception.grid.size,) * 3))
+    return made, refused
 
 
 def hangs_on_joint(perception: Perception, request: MotionRequest) -> bool:

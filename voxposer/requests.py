@@ -49,7 +49,7 @@ class MotionRequest:
 
     def rotation_at(self, voxel: np.ndarray) -> np.ndarray:
         """Rotation wanted at a voxel, unit quaternion wxyz [4]."""
-        quat = self.rotation if self.rotation.ndim == 1 else self.rotation[tuple(voxel)]
+        quat = np.asarray(self.rotation if self.rotation.ndim == 1 else self.rotation[tuple(voxel)], float)
         length = float(np.linalg.norm(quat))
         if length < 1e-6:
             raise InterfaceError("the rotation map holds a quaternion of length zero on the way")

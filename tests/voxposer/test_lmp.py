@@ -56,7 +56,7 @@ def test_an_answer_ends_at_the_lmps_own_stop_tokens(setup: Callable[..., Setup],
     robot = setup({(name, "wait"): "x = 1\n# Query: next.\nboom()", (name, "go"): "x = 1\nobjects = ['a']\nboom()"})
     getattr(robot.lmps, name)("wait")
     getattr(robot.lmps, name)("go")
-    assert [request["stop"] for request in robot.server.requests] == [stop, stop]
+    assert [request["stop"] for request in robot.server.requests] == [[f"\n{token}" for token in stop]] * 2
     assert [call.code for call in robot.lmps.trace] == ["x = 1", "x = 1"]
 
 

@@ -1,8 +1,8 @@
 """Requests to a language model through litellm: retried, counted and cached.
 
 In: chat messages, and which model of which provider (any string litellm knows; ``offline/libero``, the default, is
-``voxposer.offline`` and needs neither key nor network). Out: the text up to the first stop token, with its tokens and
-cost. Calls that fail for a passing reason (429, 5xx, timeouts, lost connections, replies that are no JSON) are repeated
+``voxposer.offline`` and needs neither key nor network). Out: the text up to the first line that starts with a stop
+token, with its tokens and cost. Calls that fail for a passing reason (429, 5xx, timeouts, lost connections, replies that are no JSON) are repeated
 with growing pauses, or after the pause the server asks for.
 
 Complete replies are kept on disk (``voxposer.language.reply_cache``). The offline writer's replies are kept in memory
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -111,7 +112,8 @@ class Llm:
 
         Args:
             messages: ``role`` and ``content`` each.
-            stop: the answer ends before the first of these; they also go to the provider where it takes them.
+            stop: the answer ends before the first line that starts with one of these; inside a line they mean nothing.
+                With a line feed before them they also go to the provider, where it takes them.
             max_tokens: length of the answer at most.
             temperature: 0 for the likeliest answer.
             check: called with the text of a new answer; if it raises, so does this, and the answer is not kept.
@@ -233,7 +235,7 @@ class Llm:
             **request["options"],
             model=request["model"],
             messages=request["messages"],
-            stop=request["stop"] or None,
+            stop=[f"\n{token}" for token in request["stop"]] or None,
             max_tokens=request["max_tokens"],
             temperature=request["temperature"],
             timeout=self.config.timeout_s,
@@ -261,6 +263,6 @@ class Llm:
 
 
 def _until(stop: Sequence[str], text: str) -> str:
-    """The text before the first stop token: not every provider stops there by itself."""
-    found = [place for place in (text.find(token) for token in stop) if place >= 0]
-    return text[: min(found, default=len(text))].strip()
+    """The text before the first line that starts with a stop token: not every provider stops there by itself."""
+    found = re.search("^(?:" + "|".join(map(re.escape, stop)) + ")", text, re.MULTILINE) if stop else None
+    return text[: found.start() if found else len(text)].strip()
