@@ -458,3 +458,32 @@ HOSTILE: tuple[tuple[str, int, str], ...] = (
     ("value", 1, "x = np.zeros(3) + np.zeros(4)"),
     ("value", 1, "x = np.zeros((2, 2))[2, 0]"),
 )
+
+# Programs that use as much as they can before they are refused; measured from outside, with the limits of production.
+HEAVY: tuple[str, ...] = (
+    "while True:\n    pass",
+    "for i in range(10 ** 9):\n    try:\n        x = 1 / 0\n    except BaseException:\n        pass",
+    "def f(n):\n    return f(n + 1) if n else 0\nwhile True:\n    try:\n        f(1)\n    except: pass",
+    "fs = []\nwhile True:\n    fs = [lambda fs=fs, a=[0] * 9: fs, [0] * 9]",
+    "g = iter(range(10))\nwhile True:\n    g = map(lambda x: x, g)",
+    "def g(n):\n    x = [n] * 100\n    yield x\nkept = []\nwhile True:\n    it = g(1); next(it); kept = [kept, it]",
+    "def f():\n    def g():\n        def h(): return f, g, h\n        return h\n    return g()\nx = []\nwhile True:\n    x = [x, f()]",
+    "d = {}\nk = 0\nwhile True:\n    d = {(k, d2): d for d2 in range(9)}; k += 1",
+    "x = {}\nwhile True:\n    x = {'a' * 9000 + str(i): [x] for i in range(99)}",
+    "m = get_map()\nkept = []\nwhile True:\n    kept = [kept, m + 1]",
+    "kept = []\nwhile True:\n    kept.append(np.array([[1.0] * 90] * 90))",
+    "kept = []\nwhile True:\n    kept = [kept, ['a' * 9999 for i in range(99)]]",
+    "x = np.zeros((200, 200, 200))\nwhile True:\n    x[np.arange(200), :, :] = np.roll(x, 1, 0)",
+    "x = np.ones((900, 900))\nwhile True:\n    x = x @ x / 900",
+    "x = np.zeros((2,) * 8)\nwhile True:\n    y = np.roll(x, (1,) * 8, axis=tuple(range(8))); z = str(y[0, 0, 0])",
+    "x = np.zeros(8000000)\nwhile True:\n    y = np.sort(x[::-1] + 1)",
+    "x = ['a' * 9999] * 9\nwhile True:\n    y = sorted(x * 9, key=lambda t: t[::-1])",
+    "x = 'ab' * 4999\nwhile True:\n    y = x.replace('ab', 'ba').strip(x)",
+    "x = '{:99.99f}' * 99\nwhile True:\n    y = x.format(*[1e308] * 99)",
+    "x = [0] * 9999\nwhile True:\n    y = x == x; z = x + [] ; w = 1 in x",
+    "x = [(i, str(i)) for i in range(3000)]\nwhile True:\n    y = dict(x); z = set(y); w = z | z",
+    "while True:\n    x = np.mgrid[0:100, 0:100, 0:100]",
+    "x = (0,)\nwhile True:\n    x = (x,)",
+    "x = []\nwhile True:\n    x = [x]",
+    "x = 1.0\nwhile True:\n    x = [*map(lambda v: [*range(99)], range(99))]",
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -13,14 +14,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.hostile_programs import HOSTILE
+from support.hostile_programs import HEAVY, HOSTILE
 from support.paths import TESTS
 
 from voxposer.sandbox.guard import Budget, HostFault, Limits, Record
 from voxposer.sandbox.interpreter import Outcome, parse
 from voxposer.sandbox.syntax import RULES, SandboxError
 
-LIMITS = Limits(steps=200_000, calls=100)
+LIMITS = Limits(steps=60_000, calls=100, memory_bytes=160 * 2**20)
 
 
 class Thing(Record):
@@ -112,6 +113,41 @@ def test_hostile_programs_are_refused_in_little_memory_without_a_file_or_process
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.stdout.strip() == f"all refused {len(HOSTILE)}", done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+MEASURED = """
+import json, os, resource, sys
+sys.path[:0] = [{here!r}, {tests!r}]
+import test_sandbox as tests
+from support.hostile_programs import HEAVY
+for place, source in enumerate(("x = 1", *HEAVY)):
+    child = os.fork()
+    if not child:
+        try:
+            tests.run(source, limits=tests.Limits())
+        except tests.SandboxError as error:
+            print(json.dumps([place, error.rule]), flush=True)
+        os._exit(0)
+    _, status, used = os.wait4(child, 0)
+    print(json.dumps([place, status, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024]), flush=True)
+"""
+
+
+@pytest.mark.heavy
+@pytest.mark.skipif(sys.platform != "linux", reason="measures a process as Linux does")
+def test_heavy_programs_stay_within_time_and_memory_as_measured_from_outside(tmp_path: Path) -> None:
+    source = MEASURED.format(tests=str(TESTS), here=str(Path(__file__).parent))
+    done = subprocess.run([sys.executable, "-B", "-c", source], capture_output=True, text=True, check=True, cwd=tmp_path)
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    refused = {row[0]: row[1] for row in rows if len(row) == 2}
+    measured = {row[0]: row[1:] for row in rows if len(row) == 4}
+    assert set(refused) == set(range(1, len(HEAVY) + 1))
+    assert set(refused.values()) <= {"steps", "memory", "time", "calls", "nesting", "size"}
+    idle = measured[0][2]
+    for place, (status, seconds, megabytes) in measured.items():
+        assert status == 0, HEAVY[place - 1]  # no signal, no crash
+        assert seconds < Limits().seconds + 2, (HEAVY[place - 1], seconds)
+        assert megabytes - idle < Limits().memory_bytes / 2**20 + 200, (HEAVY[place - 1], megabytes)
 
 
 def test_a_program_is_stopped_at_its_time_limit() -> None:
