@@ -158,8 +158,8 @@ class Interface:
             gripper_map: 1 open, 0 closed, [N, N, N].
 
         Raises:
-            InterfaceError: something else as ``movable``, a map of another shape or with values beyond single precision,
-                an affordance map without targets, an object to push without one, or one that is fixed.
+            InterfaceError: something else as ``movable``, a map of another shape or with values beyond single
+                precision, an affordance map without targets, an object to push without one, or one that is fixed.
         """
         seen = _seen(movable)
         name = str(seen["name"])

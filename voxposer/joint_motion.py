@@ -58,8 +58,8 @@ class JointMotion:
     def value_at(self, target: np.ndarray) -> float:
         """The joint value to which a target [3] for the centre pushes the part, within the joint's travel.
 
-        It is the target's distance along the direction in which the part moves now: "20 cm into the handle" is 20 cm of a
-        drawer's way, and 20 cm of the arc of a door's handle.
+        It is the target's distance along the direction in which the part moves now: "20 cm into the handle" is 20 cm
+        of a drawer's way, and 20 cm of the arc of a door's handle.
         """
         along = float((target - self.centre) @ self.way) / max(self.radius, 1e-6)
         return float(np.clip(self.opened + along, 0.0, self.joint.travel))

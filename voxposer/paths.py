@@ -28,10 +28,10 @@ def plan_paths(
 ) -> list[np.ndarray | InterfaceError]:
     """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path."""
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
-    for i, (interface, request) in enumerate(wants):
-        if hangs_on_joint(interface.perception, request):
-            paths[i] = np.stack([request.start, nearest_target(request)]).astype(float)
-    asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None and not len(paths[i])]
+    jointed = [i for i, (interface, request) in enumerate(wants) if hangs_on_joint(interface.perception, request)]
+    for i in jointed:
+        paths[i] = np.stack([wants[i][1].start, nearest_target(wants[i][1])]).astype(float)
+    asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None and i not in jointed]
     for first in range(0, len(asking), CHUNK):
         chunk = asking[first : first + CHUNK]
         for i, path in zip(chunk, _planned([wants[i] for i in chunk], config, route), strict=True):
@@ -86,7 +86,7 @@ def hangs_on_joint(perception: Perception, request: MotionRequest) -> bool:
 
 def nearest_target(request: MotionRequest) -> np.ndarray:
     """The target voxel that is nearest to the start of a motion, [3]."""
-    found = np.argwhere(request.targets)
+    found = np.argwhere(np.asarray(request.targets))
     return found[int(np.linalg.norm(found - request.start, axis=1).argmin())]
 
 

@@ -5,8 +5,8 @@ slots that push, in one call of the search. The loop is upstream's (``interfaces
 object is within a centimetre of the end of its path, and waypoints of the path that lie behind it are skipped.
 
 What is pushed may be a part that hangs on a joint: a drawer, a door or its handle. Its path is the joint's, as far as
-the target and the joint's travel allow (:class:`~voxposer.joint_motion.JointMotion`). A joint that is to be pushed to its
-end is pushed a little beyond it, so that it closes.
+the target and the joint's travel allow (:class:`~voxposer.joint_motion.JointMotion`). A joint that is to be pushed to
+its end is pushed a little beyond it, so that it closes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vecenv.errors import VecenvError
 from vecenv.manipulation.routes import Stop
@@ -99,8 +99,8 @@ class PushTask:
 
     Attributes:
         name: of the object, or of the part.
-        way: waypoints of its centre, world frame, metres, [P, 3]; the last is the goal. Of a part, they are on the way of
-            its joint.
+        way: waypoints of its centre, world frame, metres, [P, 3]; the last is the goal. Of a part, they are on the way
+            of its joint.
         joint_goal: of a part, how far its joint is to be open, metres or radians; None for an object.
         cursor: index of the next waypoint.
         pushes: number of pushes so far.
@@ -232,9 +232,7 @@ def situation(task: PushTask, perception: Perception, config: PushingConfig) -> 
     raise PushError(f"the hand has no room to begin a push of {task.name}")
 
 
-def _joint_situation(
-    task: PushTask, perception: Perception, lowest: float, config: PushingConfig
-) -> PushSituation:
+def _joint_situation(task: PushTask, perception: Perception, lowest: float, config: PushingConfig) -> PushSituation:
     """Where a part can be pushed: along its joint, and a little beyond where that ends."""
     motion = motion_of(perception, task.name)
     assert motion is not None
@@ -398,7 +396,7 @@ def _obstacles(
     points = points[np.linalg.norm((points - contacts.mean(axis=0))[:, :2], axis=1) < 0.4]
     for name in ignored:
         if name in perception.snapshot.parts:
-            part = cKDTree(perception.snapshot.parts[name].cloud.points)
+            part = KDTree(perception.snapshot.parts[name].cloud.points)
             points = points[part.query(points)[0] > config.part_margin]
     return _thinned(points[points[:, 2] > lowest - config.over_ground + 0.005])
 

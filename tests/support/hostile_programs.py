@@ -97,15 +97,29 @@ HOSTILE: tuple[tuple[str, int, str], ...] = (
     ("steps", 2, "try:\n    while True: pass\nexcept BaseException:\n    pass"),
     ("steps", 3, "while True:\n    try:\n        while True: pass\n    except:\n        continue"),
     ("steps", 3, "def f():\n    try:\n        while True: pass\n    finally:\n        return 1\nf()"),
-    ("steps", 4, "while True:\n    try:\n        try:\n            while True: pass\n        finally:\n            break\n    except: pass"),
+    (
+        "steps",
+        4,
+        "while True:\n    try:\n        try:\n            while True: pass\n        finally:\n"
+        "            break\n    except: pass",
+    ),
     ("memory", 2, "try:\n    x = np.zeros(10 ** 9)\nexcept Exception:\n    x = 1"),
-    ("memory", 4, "x = []\nwhile True:\n    try:\n        x.append(np.zeros(10 ** 6))\n    except Exception as e:\n        pass"),
+    (
+        "memory",
+        4,
+        "x = []\nwhile True:\n    try:\n        x.append(np.zeros(10 ** 6))\n    except Exception as e:\n        pass",
+    ),
     ("size", 2, "try:\n    x = 'a' * 10 ** 9\nexcept Exception:\n    pass"),
     ("calls", 4, "n = 0\nwhile True:\n    try:\n        n = detect('bowl')\n    except Exception:\n        pass"),
     ("calls", 4, "n = 0\nwhile True:\n    try:\n        n = detect('unicorn')\n    except Exception:\n        pass"),
     ("nesting", 3, "def f():\n    try:\n        return f()\n    except BaseException:\n        return 1\nf()"),
     ("nesting", 3, "def f():\n    try:\n        return f()\n    finally:\n        f()\nf()"),
-    ("steps", 5, "def g():\n    while True:\n        try:\n            yield 1\n            while True: pass\n        except: pass\nfor x in g(): pass"),
+    (
+        "steps",
+        5,
+        "def g():\n    while True:\n        try:\n            yield 1\n            while True: pass\n"
+        "        except: pass\nfor x in g(): pass",
+    ),
     # Recursion, and iterators that never end.
     ("nesting", 2, "def f():\n    return f()\nf()"),
     ("nesting", 1, "f = lambda: f(); f()"),
@@ -148,10 +162,14 @@ HOSTILE: tuple[tuple[str, int, str], ...] = (
     ("calls", 1, "x = list(filter(detect, ['bowl'] * 9999))"),
     # Closures and default arguments that hold much.
     ("memory", 2, "f = []\nfor i in range(10 ** 5): f = [lambda m=get_map(), f=f: m]"),
-    ("memory", 2, "def f(n):\n    m = np.zeros(8000000)\n    return lambda x=np.zeros(8000000): f(n + 1)() + m\nf(0)()"),
+    (
+        "memory",
+        2,
+        "def f(n):\n    m = np.zeros(8000000)\n    return lambda x=np.zeros(8000000): f(n + 1)() + m\nf(0)()",
+    ),
     ("steps", 2, "def f(x=[0]):\n    while True: x.append(x.pop())\nf()"),
     ("size", 2, "def f(x=[0]):\n    x += x\nfor i in range(99): f()"),
-    ("memory", 3, "def g(i):\n    m = np.zeros(10 ** 6); yield m\nfor i in range(999): x = [next(g(i)), g]"),
+    ("memory", 2, "def g(i):\n    m = np.zeros(10 ** 6); yield m\nfor i in range(999): x = [next(g(i)), g]"),
     ("types", 2, "def f(a, b): pass\nf(1)"),
     ("types", 2, "def f(a): pass\nf(1, a=1)"),
     ("types", 2, "def f(a): pass\nf(1, b=1)"),
@@ -467,7 +485,10 @@ HEAVY: tuple[str, ...] = (
     "fs = []\nwhile True:\n    fs = [lambda fs=fs, a=[0] * 9: fs, [0] * 9]",
     "g = iter(range(10))\nwhile True:\n    g = map(lambda x: x, g)",
     "def g(n):\n    x = [n] * 100\n    yield x\nkept = []\nwhile True:\n    it = g(1); next(it); kept = [kept, it]",
-    "def f():\n    def g():\n        def h(): return f, g, h\n        return h\n    return g()\nx = []\nwhile True:\n    x = [x, f()]",
+    (
+        "def f():\n    def g():\n        def h(): return f, g, h\n        return h\n    return g()\nx = []\n"
+        "while True:\n    x = [x, f()]"
+    ),
     "d = {}\nk = 0\nwhile True:\n    d = {(k, d2): d for d2 in range(9)}; k += 1",
     "x = {}\nwhile True:\n    x = {'a' * 9000 + str(i): [x] for i in range(99)}",
     "m = get_map()\nkept = []\nwhile True:\n    kept = [kept, m + 1]",

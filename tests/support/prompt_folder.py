@@ -1,8 +1,9 @@
 """A folder of prompts in the layout of VoxPoser's own (huangwl18/VoxPoser, ``src/prompts/rlbench``), in other words.
 
-The same file names and conventions: imports at the top, ``objects = [...]`` lines, ``# Query: ...`` examples that end in
-``# done`` or in an assignment to ``ret_val``, and one example that leaves the assignment out. :class:`Copyist` is a model
-that has nothing but such a folder: it answers a query with the example of that query in the prompt that it is shown.
+The same file names and conventions: imports at the top, ``objects = [...]`` lines, ``# Query: ...`` examples that end
+in ``# done`` or in an assignment to ``ret_val``, and one example that leaves the assignment out. :class:`Copyist` is a
+model that has nothing but such a folder: it answers a query with the example of that query in the prompt that it is
+shown.
 """
 
 from __future__ import annotations
@@ -272,8 +273,8 @@ def write(folder: Path) -> Path:
 class Copyist(ScriptedLlm):
     """A model that answers with the example of the same query, taken from the prompt that it is shown.
 
-    Where an example's query has ``{position}`` in it, it stands for a position such as ``[10 20 30]``, and ``{numbers}`` in
-    the program for its numbers.
+    Where an example's query has ``{position}`` in it, it stands for a position such as ``[10 20 30]``, and
+    ``{numbers}`` in the program for its numbers.
     """
 
     def __init__(self) -> None:

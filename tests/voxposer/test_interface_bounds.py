@@ -1,4 +1,5 @@
-"""What programs give to the functions that move the robot: only observations made by perception, only values in range."""
+"""What programs give to the functions that move the robot: only observations made by perception, only values in
+range."""
 
 from __future__ import annotations
 
@@ -112,11 +113,26 @@ POSED = "m = get_affordance_map('above')\nexecute({'name': 'cube_1', 'position':
     ("composer", "says"),
     [
         (POSED, "expected an observation"),
-        ("execute(parse_query_obj('gripper'), affordance_map=get_affordance_map('above'), rotation_map=zeros())", "zeros"),
-        ("m = get_empty_rotation_map()\nm[:] = 0\nexecute(detect('gripper'), get_affordance_map('a'), rotation_map=m)", "length zero"),
-        ("m = get_empty_rotation_map()\nm[:] = 1e300\nexecute(detect('gripper'), get_affordance_map('a'), None, m)", "single precision"),
-        ("m = get_empty_velocity_map()\nm[:] = np.inf\nexecute(detect('gripper'), None, None, None, m)", "single precision"),
-        ("m = get_empty_affordance_map()\nm[0, 0, 0] = 1\nexecute(detect('cube_1'), m[:50])", "expected (100, 100, 100)"),
+        (
+            "execute(parse_query_obj('gripper'), affordance_map=get_affordance_map('above'), rotation_map=zeros())",
+            "zeros",
+        ),
+        (
+            "m = get_empty_rotation_map()\nm[:] = 0\nexecute(detect('gripper'), get_affordance_map('a'), None, m)",
+            "length zero",
+        ),
+        (
+            "m = get_empty_rotation_map()\nm[:] = 1e300\nexecute(detect('gripper'), get_affordance_map('a'), None, m)",
+            "single precision",
+        ),
+        (
+            "m = get_empty_velocity_map()\nm[:] = np.inf\nexecute(detect('gripper'), None, None, None, m)",
+            "single precision",
+        ),
+        (
+            "m = get_empty_affordance_map()\nm[0, 0, 0] = 1\nexecute(detect('cube_1'), m[:50])",
+            "expected (100, 100, 100)",
+        ),
         ("execute(detect('table'), get_affordance_map('a'))", "it is fixed"),
         ("try:\n    execute(None)\nexcept Exception as e:\n    raise ValueError(str(e))", "expected an observation"),
     ],

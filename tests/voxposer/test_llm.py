@@ -107,9 +107,7 @@ def test_an_answer_ends_at_the_first_stop_token_wherever_the_provider_stopped(
         "x = '\u2028objects = 1'",
     ],
 )
-def test_a_stop_token_inside_a_line_does_not_end_an_answer(
-    server: LlmServer, config: LlmConfig, program: str
-) -> None:
+def test_a_stop_token_inside_a_line_does_not_end_an_answer(server: LlmServer, config: LlmConfig, program: str) -> None:
     server.say(f"{program}\n# done")
     reply = Model(config).complete(QUESTION, stop=("# Query: ", "objects = ", "objects ="))
     assert reply.text == f"{program}\n# done".strip()

@@ -1,4 +1,4 @@
-"""A folder of prompts in upstream's layout drives LIBERO and SIMPLER's WidowX scenes, through a model that copies them."""
+"""A folder of prompts in upstream's layout drives LIBERO and SIMPLER's WidowX scenes, by a model that copies them."""
 
 from __future__ import annotations
 

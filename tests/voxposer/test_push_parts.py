@@ -24,6 +24,7 @@ from voxposer.perception.view import Perception
 from voxposer.planning.config import PlannerConfig
 from voxposer.pushing import PushError, PushingConfig, arrived, next_pushes, situation, task_of
 from voxposer.requests import InterfaceError
+from voxposer.slots import Pushing
 
 CABINET = {"cabinet_1": box((0.1, 0.1, 0.15), (0.2, 0.0, 0.15), 2000)}
 NAME = "cabinet_1_handle"
@@ -103,7 +104,9 @@ def test_points_of_a_door_move_around_its_hinge_and_its_centre_in_proportion() -
     points = np.array([[0.3, 0.1, 0.2], [0.4, 0.1, 0.2]])
     ways, carried = motion.ways(points, -1.0)
     np.testing.assert_allclose(ways, [[0, -1, 0], [0, -1, 0]], atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(carried, axis=1), [2 * motion.radius / 0.2, motion.radius / 0.2], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(carried, axis=1), [2 * motion.radius / 0.2, motion.radius / 0.2], rtol=1e-6
+    )
 
 
 def test_a_part_without_room_before_it_is_not_pushed() -> None:
@@ -182,7 +185,7 @@ def test_a_drawer_is_closed_by_pushes_on_its_handle() -> None:
         agent.step()
         opened.append(_opened(env))
         phase = agent.slots[0].phase
-        pushes += [phase.task.pushes] if hasattr(phase, "task") else []
+        pushes += [phase.task.pushes] if isinstance(phase, Pushing) else []
     agent.close()
     env.close()
     assert agent.succeeded.all(), agent.slots[0].cause

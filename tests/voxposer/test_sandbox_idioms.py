@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.program_idioms import GIVEN, IDIOMS, REFUSED
-from test_sandbox import refusal, variables
+from support.sandbox_runs import refusal, variables
 
 
 @pytest.mark.parametrize("name", IDIOMS)
@@ -66,7 +66,9 @@ def test_a_programs_maps_are_released_with_it() -> None:
 
     from voxposer.sandbox.interpreter import parse
 
-    source = "m = get_map()\ndef f():\n    k = get_map()\n    g = lambda: (k, m)\n    return g\nh = f()\nx = h()[0].sum()"
+    source = (
+        "m = get_map()\ndef f():\n    k = get_map()\n    g = lambda: (k, m)\n    return g\nh = f()\nx = h()[0].sum()"
+    )
     gc.disable()
     try:
         parse(source).run({"get_map": get_map}, returns="ret_val")

@@ -2,8 +2,8 @@
 
 In: chat messages, and which model of which provider (any string litellm knows; ``offline/libero``, the default, is
 ``voxposer.offline`` and needs neither key nor network). Out: the text up to the first line that starts with a stop
-token, with its tokens and cost. Calls that fail for a passing reason (429, 5xx, timeouts, lost connections, replies that are no JSON) are repeated
-with growing pauses, or after the pause the server asks for.
+token, with its tokens and cost. Calls that fail for a passing reason (429, 5xx, timeouts, lost connections, replies
+that are no JSON) are repeated with growing pauses, or after the pause the server asks for.
 
 Complete replies are kept on disk (``voxposer.language.reply_cache``). The offline writer's replies are kept in memory
 only: they cost nothing, and another version may write others.

@@ -10,8 +10,8 @@ object moves along with the hand, take the best, push, observe again. Upstream m
 sample and then takes its mean. A translation moves the mean equally, so here a sample takes only a few operations and
 the costs are the same.
 
-What hangs on a joint (a drawer, a door, a handle) moves only as the joint lets it: its pushes go along the way that each
-point moves (``ways``), and the model moves its centre along the joint, not along with the hand.
+What hangs on a joint (a drawer, a door, a handle) moves only as the joint lets it: its pushes go along the way that
+each point moves (``ways``), and the model moves its centre along the joint, not along with the hand.
 
 Three points differ, to suit a real hand. Pushing from further back on the same line predicts the same, so the
 chosen contact is moved to where the hand, coming from behind, first touches. By default directions are level: a hand on
@@ -160,12 +160,11 @@ def best_push(
     low, high = (_heights(limit, default, slots) for limit, default in ((lowest, -jnp.inf), (highest, jnp.inf)))
     usable, free = _usable_and_free(points, valid, touchable)
     points = jnp.where(usable[..., None], points, 0)
-    free_ways = jnp.zeros_like(points)
-    joint = tuple(free_ways if given is None else jnp.asarray(given) for given in (ways, carried))
+    way, carry = (jnp.zeros_like(points) if given is None else jnp.asarray(given) for given in (ways, carried))
     in_axes = (0, 0, 0, None if normals is None else 0, 0, 0, 0, 0, 0, 0)
     search = jax.vmap(partial(_search, config=config), in_axes=in_axes)
     normals = None if normals is None else jnp.asarray(normals)
-    return search(points, usable, free, normals, target, _keys(key, slots), low, high, *joint)
+    return search(points, usable, free, normals, target, _keys(key, slots), low, high, way, carry)
 
 
 def _usable_and_free(

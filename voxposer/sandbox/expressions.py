@@ -1,7 +1,7 @@
 """Expressions of a program: a method for each kind of node, which gives its value in a scope.
 
-In: nodes that ``voxposer.sandbox.syntax`` has checked, and the :class:`~voxposer.sandbox.scopes.Scope` they stand in. Out:
-values that the guard has accepted, or a ``SandboxError`` with the line of the innermost node that failed.
+In: nodes that ``voxposer.sandbox.syntax`` has checked, and the :class:`~voxposer.sandbox.scopes.Scope` they stand in.
+Out: values that the guard has accepted, or a ``SandboxError`` with the line of the innermost node that failed.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class Expressions:
         }
 
     def close(self) -> None:
-        """Let go of the tables and of the variables that functions refer to: with them, a run's maps are released at once
-        and not with the next collection of cycles."""
+        """Let go of the tables and of the variables that functions refer to: with them, a run's maps are released at
+        once and not with the next collection of cycles."""
         self._evaluate, self._functions = {}, {}
         for scope in self._captured:
             scope.variables.clear()
@@ -157,7 +157,9 @@ class Expressions:
 
     def _field(self, record: Record, name: object) -> Any:
         if not isinstance(name, str) or name.startswith("_"):
-            raise Refusal("attributes", f"an observation's fields are named; {shortened(repr(name), 80)} is none of them")
+            raise Refusal(
+                "attributes", f"an observation's fields are named; {shortened(repr(name), 80)} is none of them"
+            )
         try:
             return self._guard.host(f"the observation's {name[:80]}", record.__getitem__, name)
         except Refusal as refusal:
@@ -366,7 +368,9 @@ class Expressions:
             if keyword.arg is not None:
                 more = {keyword.arg: more}
             elif not isinstance(more, dict) or not all(isinstance(name, str) for name in more):
-                raise Refusal("types", f"** of a value of kind {kind_of(more)}; it takes a dictionary with text as keys")
+                raise Refusal(
+                    "types", f"** of a value of kind {kind_of(more)}; it takes a dictionary with text as keys"
+                )
             if not more.keys().isdisjoint(named):
                 raise Refusal("types", "the same argument is given twice")
             named.update(more)

@@ -1,8 +1,8 @@
 """Values as text: ``str``, ``repr``, f-strings, ``str.format`` and ``%``.
 
-In: a ``Guard`` and values that it has accepted. Out: text of a bounded length that is the same in every process. A format
-may set a fill, an alignment, a sign, a width, a precision and a type, the numbers with two digits at most; fields of
-``str.format`` are values and not walks to their attributes or items.
+In: a ``Guard`` and values that it has accepted. Out: text of a bounded length that is the same in every process. A
+format may set a fill, an alignment, a sign, a width, a precision and a type, the numbers with two digits at most;
+fields of ``str.format`` are values and not walks to their attributes or items.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Stream, 
 # Numbers in one piece of text.
 _PRINTED = 1000
 _FORMAT = re.compile(r"([^{}]?[<>^=])?[-+ ]?#?0?\d{0,2}[,_]?(\.\d{1,2})?[bcdeEfFgGosxX%]?")
-_PERCENT = re.compile(r"%(?:\((?P<key>[^()]*)\))?(?P<flags>[-+ 0#]*)(?P<width>\*|\d*)(?P<digits>\.\*|\.\d*)?(?P<type>.|$)", re.S)
+_PERCENT = re.compile(
+    r"%(?:\((?P<key>[^()]*)\))?(?P<flags>[-+ 0#]*)(?P<width>\*|\d*)(?P<digits>\.\*|\.\d*)?(?P<type>.|$)", re.S
+)
 _PERCENT_TYPES = "sdifFgGeExXrou"
 
 
@@ -60,7 +62,9 @@ def formatted(guard: Guard, value: object, spec: str, conversion: str = "") -> s
     if not _FORMAT.fullmatch(spec):
         raise Refusal("formats", f"the format {spec[:40]!r}; write one such as .2f, 5d or >10, with two digits at most")
     if kind_of(value) not in ("number", "text"):
-        raise Refusal("types", f"the format {spec!r} for a value of kind {kind_of(value)}; format its numbers one by one")
+        raise Refusal(
+            "types", f"the format {spec!r} for a value of kind {kind_of(value)}; format its numbers one by one"
+        )
     made = format(value.item() if isinstance(value, np.generic) else value, spec)  # pyright: ignore[reportArgumentType]
     guard.characters(len(made))
     return made

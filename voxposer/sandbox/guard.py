@@ -360,8 +360,8 @@ _KINDS: dict[type, str] = {
 
 
 def kind_of(value: object) -> str:
-    """The kind of a value: number, array, text, list, tuple, dictionary, set, range, observation, map, function, iterator,
-    error, class of errors, type, None.
+    """The kind of a value: number, array, text, list, tuple, dictionary, set, range, observation, map, function,
+    iterator, error, class of errors, type, None.
 
     Raises:
         Refusal: programs may not hold it.

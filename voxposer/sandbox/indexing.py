@@ -1,4 +1,4 @@
-"""Reading, writing and deleting places in arrays, lists and dictionaries, with upstream's leniency where an array is a map.
+"""Reading, writing and deleting places in arrays, lists and dictionaries, leniently where an array is a map.
 
 In: a ``Guard``, a value and an index that a program wrote. Out: what is there, or the place changed. What an index
 would select is counted before NumPy gets it: a few integers can ask for terabytes.

@@ -90,12 +90,7 @@ def _zip(sources: list[Iterator[Any]], strict: bool) -> Iterator[Any]:
 
 def enumerated(guard: Guard, iterable: object, start: object = 0) -> Stream:
     """``enumerate``."""
-    return stream(guard, "enumerate", _enumerate(iterate(guard, iterable), integer(start)))
-
-
-def _enumerate(items: Iterable[Any], start: int) -> Iterator[Any]:
-    for number, item in enumerate(items, start):
-        yield number, item
+    return stream(guard, "enumerate", enumerate(iterate(guard, iterable), integer(start)))
 
 
 def mapped(guard: Guard, function: object, *values: object) -> Stream:

@@ -20,8 +20,10 @@ from voxposer.sandbox.values import DTYPES
 
 # Modules of VoxPoser's prompts and source, and of the library that its prompts import.
 GIVEN = frozenset(
-    """env_utils perception_utils plan_utils action_utils utils interfaces LMP transforms3d transforms3d.euler
-    transforms3d.quaternions""".split()
+    {
+        *("env_utils", "perception_utils", "plan_utils", "action_utils", "utils", "interfaces", "LMP"),
+        *("transforms3d", "transforms3d.euler", "transforms3d.quaternions"),
+    }
 )
 # Modules that say something about types only, or about the language.
 _IGNORED = frozenset({"typing", "typing_extensions", "collections.abc", "numpy.typing", "__future__"})
@@ -79,7 +81,9 @@ def _part(module: str, alias: ast.alias, given: Mapping[str, Function]) -> dict[
         if alias.name in given:
             return {name: given[alias.name]} if alias.asname else {}
         if alias.asname:
-            raise Refusal("imports", f"{alias.name!r} of {module} is not given to this program, so it has no other name")
+            raise Refusal(
+                "imports", f"{alias.name!r} of {module} is not given to this program, so it has no other name"
+            )
         return {}
     if module in _TABLES or module == "numpy.linalg":
         return {name: member(Module(module), alias.name)}

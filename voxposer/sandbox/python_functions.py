@@ -12,7 +12,7 @@ from typing import Any, SupportsIndex
 import numpy as np
 import numpy.typing as npt
 
-from voxposer.sandbox.guard import Guard, Refusal, kind_of, refuse_kind
+from voxposer.sandbox.guard import Guard, Refusal, refuse_kind
 from voxposer.sandbox.iteration import callable_of
 from voxposer.sandbox.numpy_functions import round_array
 from voxposer.sandbox.objects import DType, Error, ErrorType, TypeName
@@ -48,7 +48,9 @@ def _require_comparable(guard: Guard, items: list[Any]) -> None:
     weight = guard.weigh(items)
     wrong = weight.kinds - {"number", "text", "None"}
     if wrong:
-        raise Refusal("types", f"values of kind {', '.join(sorted(wrong))} put in order; give a key=, such as a position")
+        raise Refusal(
+            "types", f"values of kind {', '.join(sorted(wrong))} put in order; give a key=, such as a position"
+        )
     guard.budget.step(len(items) + weight.characters // 100)
 
 

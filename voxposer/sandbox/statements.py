@@ -133,10 +133,10 @@ class Statements(Expressions):
         """Assign to targets; an assignment to the name that is returned ends the program."""
         for target in targets:
             self.store(target, value, scope)
-        if self._returns is not None and any(_assigns(target, self._returns) for target in targets):
-            if scope.home(self._returns).parent is None:
-                return Returned(scope.program.variables[self._returns])
-        return None
+        name = self._returns
+        if name is None or scope.home(name).parent is not None or not any(_assigns(target, name) for target in targets):
+            return None
+        return Returned(scope.program.variables[name])
 
     def _augment(self, node: ast.AugAssign, scope: Scope) -> None:
         right, symbol = self.eval(node.value, scope), SYMBOLS[type(node.op)]
@@ -255,7 +255,9 @@ class Statements(Expressions):
         if isinstance(error, ErrorType):
             error = Error(error.python, "")
         if not isinstance(error, Error):
-            raise Refusal("types", f"raise takes an error such as ValueError('...'), not a value of kind {kind_of(error)}")
+            raise Refusal(
+                "types", f"raise takes an error such as ValueError('...'), not a value of kind {kind_of(error)}"
+            )
         raise Refusal("raised", f"{error.python.__name__}: {error.text}", error.python)
 
     def _assert(self, node: ast.Assert, scope: Scope) -> None:

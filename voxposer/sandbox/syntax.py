@@ -3,9 +3,9 @@
 In: source text. Out: a syntax tree in which every node is allowed, or a ``SandboxError`` that names the line and the
 rule. Everything else is refused before anything runs.
 
-The language is Python without classes, decorators, ``with``, ``match``, ``async``, shifts, complex numbers and bytes, and
-with names instead of walks: attributes are read from observations, arrays, modules and errors alone, and imports bring
-nothing but what programs may use anyway (``voxposer.sandbox.vocabulary``).
+The language is Python without classes, decorators, ``with``, ``match``, ``async``, shifts, complex numbers and bytes,
+and with names instead of walks: attributes are read from observations, arrays, modules and errors alone, and imports
+bring nothing but what programs may use anyway (``voxposer.sandbox.vocabulary``).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ RULES: Mapping[str, str] = MappingProxyType(
         "names": "a name is a variable, a given function or one of the vocabulary's",
         "attributes": "attributes are an observation's fields, or an array's shape, ndim, size and T, and only read",
         "functions": "modules are no values, and only functions are called",
-        "values": "values are numbers, text, arrays of numbers, lists, tuples, dictionaries, sets, functions, iterators, "
-        "errors, types, observations and maps",
+        "values": "values are numbers, text, arrays of numbers, lists, tuples, dictionaries, sets, functions, "
+        "iterators, errors, types, observations and maps",
         "types": "operators and functions get values they are made for",
         "value": "operations have a result",
         "call": "a given function did what it was asked",
@@ -183,12 +183,6 @@ def _check(node: ast.AST) -> None:
     check = _CHECKS.get(type(node))
     if check is not None:
         check(node)
-
-
-def _called(node: ast.AST) -> str:
-    """What people call a kind of node: "an assert statement"."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(node).__name__).lower()
-    return f"a '{words}'"
 
 
 def _called(node: ast.AST) -> str:

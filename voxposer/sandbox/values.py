@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable, Mapping, Sequence, Sized
+from collections.abc import Iterable, Mapping, Sized
 from types import MappingProxyType
 from typing import Any, SupportsIndex, cast
 
@@ -156,7 +156,8 @@ def truth(guard: Guard, value: object) -> bool:
         raise Refusal("types", f"an array of {value.size} elements is neither true nor false; use .any() or .all()")
     if isinstance(value, RecordList):
         return length_of(guard, value) > 0
-    return True if isinstance(value, (Record, Opaque, Function, Stream, Error, ErrorType, DType, TypeName)) else bool(value)
+    always = (Record, Opaque, Function, Stream, Error, ErrorType, DType, TypeName)
+    return isinstance(value, always) or bool(value)
 
 
 def hashable(guard: Guard, key: object) -> Any:
@@ -171,7 +172,9 @@ def hashable(guard: Guard, key: object) -> Any:
 
 
 def _holds_unhashable(key: tuple[Any, ...]) -> bool:
-    return any(isinstance(item, (list, dict, set)) or (isinstance(item, tuple) and _holds_unhashable(item)) for item in key)
+    return any(
+        isinstance(item, (list, dict, set)) or (isinstance(item, tuple) and _holds_unhashable(item)) for item in key
+    )
 
 
 def iterate(guard: Guard, value: object) -> Iterable[Any]:

@@ -26,8 +26,8 @@ CONSTANTS: Mapping[str, Any] = MappingProxyType(
 )
 
 
-_UNARY = """abs absolute fabs sqrt cbrt square exp exp2 log log2 log10 sin cos tan sinh cosh tanh arcsin arccos arctan deg2rad
-rad2deg radians degrees floor ceil trunc rint sign isnan isinf isfinite negative logical_not"""
+_UNARY = """abs absolute fabs sqrt cbrt square exp exp2 log log2 log10 sin cos tan sinh cosh tanh arcsin arccos arctan
+deg2rad rad2deg radians degrees floor ceil trunc rint sign isnan isinf isfinite negative logical_not"""
 _BINARY = """add subtract multiply divide true_divide floor_divide maximum minimum fmax fmin arctan2 power mod remainder
 hypot logical_and logical_or logical_xor equal not_equal less less_equal greater greater_equal"""
 _REDUCTIONS = """sum mean min max amin amax std var prod any all median ptp"""
@@ -97,8 +97,8 @@ def _of_numbers(function: Function) -> Function:
     return lambda guard, *values: function(*(number_of(value) for value in values))
 
 
-_MATH = """sqrt sin cos tan asin acos atan atan2 sinh cosh tanh floor ceil trunc fabs degrees radians hypot isclose isnan
-isinf isfinite exp log log2 log10 copysign fmod"""
+_MATH = """sqrt sin cos tan asin acos atan atan2 sinh cosh tanh floor ceil trunc fabs degrees radians hypot isclose
+isnan isinf isfinite exp log log2 log10 copysign fmod"""
 
 MATH: Mapping[str, Function] = MappingProxyType(
     {name: _of_numbers(getattr(math, name)) for name in _MATH.split()}
@@ -212,7 +212,12 @@ METHODS: Mapping[str, Mapping[str, Function]] = MappingProxyType(
         | {name: pyf.text_method(name, 0, 1) for name in ("strip", "lstrip", "rstrip")}
         | {name: pyf.text_method(name, 1, 1) for name in _TEXT_SEARCHES.split()}
         | {name: pyf.padding(name) for name in ("ljust", "rjust", "center", "zfill")}
-        | {"split": pyf.split_text, "replace": pyf.replace_text, "join": pyf.join_text, "format": formatting.format_text},
+        | {
+            "split": pyf.split_text,
+            "replace": pyf.replace_text,
+            "join": pyf.join_text,
+            "format": formatting.format_text,
+        },
         "number": {"item": pyf.array_item, "tolist": pyf.tolist, "astype": pyf.astype}
         | {name: NUMPY[name] for name in ("copy", "round", "clip", "any", "all", "sum", "min", "max", "mean")}
         | {"is_integer": lambda guard, value: float(number_of(value)).is_integer()},
