@@ -361,7 +361,8 @@ def _fits(
     """Whether pushes of an object at ``contacts`` [M, 3] along ``ahead`` [M, 3] have room, bool [M].
 
     ``start`` is the distance before the contact at which the hand starts, and its slant. The whole hand needs room
-    there; on the way to the contact its fingers need room, the pushed object ignored.
+    there; on the way to the contact its fingers need room, the pushed object ignored. A part does not move aside, so the
+    wrist that pushes it must also keep its distance from the robot's base.
     """
     distance, slant = start
     begin = _raised(contacts - distance * ahead, lowest)
@@ -374,6 +375,9 @@ def _fits(
         between = _raised(contacts[free] - share * distance * ahead[free], lowest)
         hit[free] = _meets(others, between, hands[free], config.body[:1], 0.0)
     reach = config.reach - config.slanted_reach * max(np.sin(slant), 0.0)
+    if name in perception.snapshot.parts:
+        wrist = begin - perception.config.wrist_back * hands[:, :, 2] - perception.base
+        hit |= np.linalg.norm(wrist[:, :2], axis=1) < perception.config.nearest
     return ~hit & (np.linalg.norm((begin - perception.base)[:, :2], axis=1) < reach)
 
 
