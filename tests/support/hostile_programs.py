@@ -160,6 +160,12 @@ HOSTILE: tuple[tuple[str, int, str], ...] = (
     ("calls", 1, "x = list(map(detect, ['bowl'] * 9999))"),
     ("call", 1, "x = list(map(detect, ['bowl', 'unicorn']))"),
     ("calls", 1, "x = list(filter(detect, ['bowl'] * 9999))"),
+    (
+        "nesting",
+        5,
+        "def f():\n    if 1:\n        for i in [1]:\n            try:\n                yield from f()\n"
+        "            finally: pass\nlist(f())",
+    ),
     # Closures and default arguments that hold much.
     ("memory", 2, "f = []\nfor i in range(10 ** 5): f = [lambda m=get_map(), f=f: m]"),
     (
@@ -443,7 +449,12 @@ HOSTILE: tuple[tuple[str, int, str], ...] = (
     ("value", 1, "x = np.mean([])"),
     ("value", 1, "x = np.cross([1, 2], [3, 4])"),
     ("names", 1, "x = np.random.rand(3)"),
-    # Much for the host to print or keep.
+    # Much for the host to print or keep, and long messages.
+    ("raised", 1, "raise ValueError('a' * 9999)"),
+    ("raised", 3, "try:\n    detect('a' * 9999)\nexcept Exception as e: raise ValueError(str(e) * 9)"),
+    ("types", 1, "raise 'a' * 9999"),
+    ("names", 1, "x = " + "a" * 9999),
+    ("attributes", 1, "x = detect('bowl')['a' * 9999]"),
     ("size", 1, "detect(range(10 ** 9))"),
     ("types", 1, "detect([range(10 ** 9)])"),
     ("size", 1, "detect(['a' * 9000] * 9)"),

@@ -62,6 +62,17 @@ def test_hostile_programs_are_refused_in_little_memory_without_a_file_or_process
     assert list(tmp_path.iterdir()) == []
 
 
+NESTING = tuple(source for rule, _, source in HOSTILE if rule == "nesting" and "f(" in source or "next(g)" in source)
+
+
+@pytest.mark.parametrize("source", NESTING)
+def test_depth_is_refused_before_pythons_own_limit_even_far_down_the_stack(source: str) -> None:
+    def deep(frames: int) -> SandboxError:
+        return deep(frames - 1) if frames else refusal(source)
+
+    assert "recursion" not in deep(300).reason
+
+
 MEASURED = """
 import json, os, resource, sys
 sys.path[:0] = [{tests!r}]

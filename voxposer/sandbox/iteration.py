@@ -18,28 +18,28 @@ from voxposer.sandbox.values import integer, iterate, listed, single_number, tru
 _NOTHING = object()
 
 
-def stream(guard: Guard, name: str, items: Iterable[Any]) -> Stream:
-    """An iterator over items, counted as they are taken."""
-    return Stream(name, _pulled(guard, iter(items)))
+# Levels of depth that taking an item from an iterator counts for.
+_LEVELS = 2
 
 
-def _pulled(guard: Guard, items: Iterator[Any]) -> Iterator[Any]:
+def stream(guard: Guard, name: str, items: Iterable[Any], levels: int = _LEVELS) -> Stream:
+    """An iterator over items, counted as they are taken: a step each, and ``levels`` of depth meanwhile."""
+    return Stream(name, _pulled(guard, iter(items), levels))
+
+
+def _pulled(guard: Guard, items: Iterator[Any], levels: int) -> Iterator[Any]:
     budget = guard.budget
     while True:
         depth = budget.depth
         try:
             budget.step()
-            budget.deeper(_LEVELS)
+            budget.deeper(levels)
             item = next(items)
         except StopIteration:
             return
         finally:
             budget.depth = depth
         yield item
-
-
-# Levels that taking an item from an iterator counts for.
-_LEVELS = 2
 
 
 def callable_of(value: object) -> Callable[..., Any]:

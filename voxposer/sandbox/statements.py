@@ -300,7 +300,7 @@ class Statements(Expressions):
             inner = self._inner(names, signature.bound(given, options), scope)
             if yields:
                 self._captured.append(inner)
-                return self._guard.take(stream(self._guard, "generator", self._generated(body, inner)))
+                return self._guard.take(stream(self._guard, "generator", self._generated(body, inner), levels))
             budget, depth = self._guard.budget, self._guard.budget.depth
             try:
                 budget.deeper(levels)
