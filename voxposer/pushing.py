@@ -361,8 +361,8 @@ def _fits(
     """Whether pushes of an object at ``contacts`` [M, 3] along ``ahead`` [M, 3] have room, bool [M].
 
     ``start`` is the distance before the contact at which the hand starts, and its slant. The whole hand needs room
-    there; on the way to the contact its fingers need room, the pushed object ignored. A part does not move aside, so the
-    wrist that pushes it must also keep its distance from the robot's base.
+    there; on the way to the contact its fingers need room, the pushed object ignored. A part does not move aside, so
+    the wrist that pushes it must also keep its distance from the robot's base.
     """
     distance, slant = start
     begin = _raised(contacts - distance * ahead, lowest)

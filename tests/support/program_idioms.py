@@ -281,6 +281,7 @@ x = f'{v:.{n}f}' + f'{v!s:>{n + 3}}' + f'{n=}'
 x = '{} and {}'.format(1, 'b')
 y = '{1} {0} {name}'.format(1, 2, name='c')
 z = '{:.2f} {:>4} {:{w}}'.format(1.5, 'a', 7, w=3)
+v = '{guard} {template} {value}'.format(guard=1, template=2, value=3)
 w = '{{}} {!r}'.format('q')
 """,
     "percent formats": """\
@@ -390,7 +391,9 @@ x.clear()
 """,
     "dictionaries": """\
 d = dict(a=1, b=2)
-d.update({'c': 3})
+d.update({'c': 3}, value=4, given=5, guard=6, name=7)
+for k in ('value', 'given', 'guard', 'name'):
+    del d[k]
 x = d.pop('a'), d.setdefault('e', []), d.get('z'), 'b' in d, len(d), list(d)
 del d['b']
 for k, v in d.items():
@@ -478,6 +481,7 @@ x = c2i(10, 'z')
 """,
         5,
     ),
+    "an argument by its name": ("x = detect(name='bowl').name", "bowl"),
     "a module of the prompts": (
         """\
 import perception_utils as p

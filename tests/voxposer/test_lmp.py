@@ -52,7 +52,9 @@ class no_error:
 def test_a_map_program_without_ret_val_returns_the_map_it_made(setup: Callable[..., Setup]) -> None:
     """Two of upstream's own examples end so."""
     made = "affordance_map = get_empty_affordance_map()\naffordance_map[1, 2, 3] = 1"
-    robot = setup({("get_affordance_map", "here"): made, ("get_affordance_map", "there"): "m = get_empty_affordance_map()"})
+    robot = setup(
+        {("get_affordance_map", "here"): made, ("get_affordance_map", "there"): "m = get_empty_affordance_map()"}
+    )
     np.testing.assert_array_equal(np.argwhere(robot.lmps.get_affordance_map("here")()), [[1, 2, 3]])
     with pytest.raises(LmpError, match="returned nothing, not a map"):
         robot.lmps.get_affordance_map("there")()

@@ -62,7 +62,7 @@ def test_hostile_programs_are_refused_in_little_memory_without_a_file_or_process
     assert list(tmp_path.iterdir()) == []
 
 
-NESTING = tuple(source for rule, _, source in HOSTILE if rule == "nesting" and "f(" in source or "next(g)" in source)
+NESTING = tuple(source for rule, _, source in HOSTILE if rule == "nesting" and ("f(" in source or "next(g)" in source))
 
 
 @pytest.mark.parametrize("source", NESTING)

@@ -70,7 +70,7 @@ def formatted(guard: Guard, value: object, spec: str, conversion: str = "") -> s
     return made
 
 
-def format_text(guard: Guard, template: str, *values: object, **named: object) -> str:
+def format_text(guard: Guard, template: str, /, *values: object, **named: object) -> str:
     """``template.format(*values, **named)``, whose fields are numbers, names or nothing."""
     pieces: list[str] = []
     automatic = 0

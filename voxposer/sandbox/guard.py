@@ -253,7 +253,7 @@ class Guard:
                 self.take(item)
         return self.take(value)
 
-    def host(self, name: str, function: Callable[..., Any], *arguments: object, **named: object) -> Any:
+    def host(self, name: str, function: Callable[..., Any], /, *arguments: object, **named: object) -> Any:
         """Call a function of the host, its time not counted.
 
         Raises:

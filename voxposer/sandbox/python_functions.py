@@ -199,14 +199,14 @@ def is_callable(guard: Guard, value: object) -> bool:
     return isinstance(value, (FunctionValue, DType, ErrorType))
 
 
-def make_dict(guard: Guard, given: object = (), **named: object) -> dict[Any, Any]:
+def make_dict(guard: Guard, given: object = (), /, **named: object) -> dict[Any, Any]:
     """``dict``."""
     made: dict[Any, Any] = {}
     update_dict(guard, made, given, **named)
     return made
 
 
-def update_dict(guard: Guard, value: dict[Any, Any], given: object = (), **named: object) -> None:
+def update_dict(guard: Guard, value: dict[Any, Any], given: object = (), /, **named: object) -> None:
     """``dict.update``."""
     pairs = list(given.items()) if isinstance(given, dict) else [listed(guard, pair) for pair in listed(guard, given)]
     guard.length(len(value) + len(pairs) + len(named))
@@ -372,11 +372,11 @@ def sort_list(guard: Guard, value: list[Any], *, key: object = None, reverse: ob
     value[:] = in_order(guard, value, key, reverse)
 
 
-def replace_text(guard: Guard, value: str, old: str, new: str) -> str:
+def replace_text(guard: Guard, value: str, old: str, new: str, count: object = -1) -> str:
     """``str.replace``."""
     found = value.count(require_text(old))
     guard.characters(len(value) + found * len(require_text(new)))
-    return value.replace(old, new)
+    return value.replace(old, new, integer(count))
 
 
 def join_text(guard: Guard, value: str, parts: object) -> str:
