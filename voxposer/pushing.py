@@ -117,7 +117,7 @@ class PushTask:
     failed: list[np.ndarray] = field(default_factory=list)
 
 
-def task_of(name: str, path: np.ndarray, perception: Perception, config: PushingConfig = PushingConfig()) -> PushTask:
+def task_of(name: str, path: np.ndarray, perception: Perception) -> PushTask:
     """The task of pushing an object along a path [P, 3], or a part to where its joint comes nearest to the path's end.
 
     Raises:

@@ -13,7 +13,7 @@ from support.voxposer_world import HOME, box, snapshot
 import vecenv
 from vecenv.contract import BatchEnv
 from vecenv.manipulation.routes import RouteConfig
-from vecenv.observations import Part, PartJoint
+from vecenv.observations import Part, PartJoint, PointCloud
 from voxposer import pushing
 from voxposer.agent import Agent, AgentConfig
 from voxposer.interface import Interface
@@ -22,7 +22,16 @@ from voxposer.paths import plan_paths
 from voxposer.perception.config import HandState
 from voxposer.perception.view import Perception
 from voxposer.planning.config import PlannerConfig
-from voxposer.pushing import PushError, PushingConfig, arrived, next_pushes, situation, task_of
+from voxposer.pushing import (
+    PushError,
+    PushingConfig,
+    PushSituation,
+    PushTask,
+    arrived,
+    next_pushes,
+    situation,
+    task_of,
+)
 from voxposer.requests import InterfaceError
 from voxposer.slots import Pushing
 
@@ -117,6 +126,38 @@ def test_a_part_without_room_before_it_is_not_pushed() -> None:
     task = task_of(NAME, np.array([centre, centre - [0, 0.3, 0]]), perception)
     with pytest.raises(PushError, match="no room to begin a push of cabinet_1_handle"):
         situation(task, perception, PushingConfig())
+
+
+def test_a_handle_is_pushed_open_where_the_hand_has_room_behind_it() -> None:
+    def opening(things: dict[str, PointCloud]) -> tuple[PushTask, Perception]:
+        perception = Perception(snapshot(things, tuple(things), parts={NAME: drawer(0.0)}), HandState(HOME, HOME, True))
+        centre = perception.snapshot.parts[NAME].cloud.points.mean(axis=0)
+        return task_of(NAME, np.array([centre, centre + [0, 0.3, 0]]), perception), perception
+
+    task, perception = opening(CABINET)
+    with pytest.raises(PushError, match="no room to begin a push of cabinet_1_handle open"):
+        situation(task, perception, PushingConfig())
+    task, perception = opening({"cabinet_1": box((0.1, 0.02, 0.02), (0.2, -0.3, 0.02), 400)})  # far behind the handle
+    (stops,) = next_pushes([situation(task, perception, PushingConfig())], PushingConfig())
+    assert stops[2].pos[1] > stops[1].pos[1] + 0.08
+
+
+def test_a_part_and_an_object_are_pushed_in_one_call_as_each_is_alone() -> None:
+    part = seen(drawer(0.1))
+    centre = part.snapshot.parts[NAME].cloud.points.mean(axis=0)
+    plate = Perception(snapshot({"plate_1": box((0.07, 0.07, 0.02), (0, 0, 0.02))}), HandState(HOME, HOME, True))
+
+    def situations() -> list[PushSituation]:
+        shut = task_of(NAME, np.array([centre, centre - [0, 0.3, 0]]), part)
+        slid = task_of("plate_1", np.array([[0.2, 0.0, 0.02]]), plate)
+        return [situation(task, view, PushingConfig()) for task, view in ((shut, part), (slid, plate))]
+
+    together = next_pushes(situations(), PushingConfig())
+    alone = [next_pushes([each], PushingConfig())[0] for each in situations()]
+    for stops, own in zip(together, alone, strict=True):
+        np.testing.assert_allclose([stop.pos for stop in stops], [stop.pos for stop in own], atol=1e-6)
+    assert np.abs(together[0][2].pos - together[0][1].pos).argmax() == 1  # along the slide
+    assert np.abs(together[1][2].pos - together[1][1].pos).argmax() == 0  # towards the goal
 
 
 def test_a_part_that_moves_upwards_is_not_pushed() -> None:
