@@ -139,7 +139,7 @@ def percent(guard: Guard, template: str, given: object) -> str:
         else:
             raise Refusal("types", f"a format with more than the {len(values)} values given after %")
         pieces.append(_percent_piece(guard, found, value))
-    if not named and taken < len(values) and not isinstance(given, dict):
+    if not named and taken < len(values) and not isinstance(given, (dict, list, range)):
         raise Refusal("types", f"{len(values)} values after % for a format with {taken} places")
     pieces.append(template[end:])
     guard.characters(sum(len(piece) for piece in pieces))

@@ -16,7 +16,16 @@ import numpy as np
 from voxposer.sandbox.formatting import percent
 from voxposer.sandbox.guard import Guard, Refusal, kind_of, refuse_kind
 from voxposer.sandbox.objects import Stream
-from voxposer.sandbox.values import APPENDED_BYTES, broadcast, hashable, number_of, numbers, require_power, truth
+from voxposer.sandbox.values import (
+    APPENDED_BYTES,
+    broadcast,
+    hashable,
+    listed,
+    number_of,
+    numbers,
+    require_power,
+    truth,
+)
 
 # Multiplications of a matrix product that a program may ask for.
 _MULTIPLICATIONS = 10**8
@@ -31,6 +40,8 @@ def arithmetic(guard: Guard, symbol: str, left: object, right: object, in_place:
     """
     if (_numeric(left) and _numeric(right)) or _mixed(left, right):
         return _numeric_operation(guard, symbol, left, right, in_place)
+    if in_place and isinstance(left, list) and symbol in ("+", "*"):
+        return _list_in_place(guard, symbol, left, right)
     if symbol == "+" and isinstance(left, _SEQUENCES) and isinstance(right, _SEQUENCES) and type(left) is type(right):
         _require_length(guard, left, len(left) + len(right))
         guard.hold(len(right) * APPENDED_BYTES)
@@ -70,6 +81,19 @@ def _require_length(guard: Guard, like: object, length: int) -> None:
         guard.characters(length)
     else:
         guard.length(length)
+
+
+def _list_in_place(guard: Guard, symbol: str, left: list[Any], right: object) -> list[Any]:
+    """``left += right`` of anything to loop over, and ``left *= right``: the same list, changed."""
+    before = len(left)
+    if symbol == "+":
+        more = listed(guard, right)
+        guard.length(before + len(more))
+        left.extend(more)
+    else:
+        left[:] = _repeated(guard, left, right)
+    guard.hold(max(len(left) - before, 0) * APPENDED_BYTES)
+    return left
 
 
 def _repeated(guard: Guard, left: object, right: object) -> Any:
