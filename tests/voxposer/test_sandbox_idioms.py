@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 from support.program_idioms import GIVEN, IDIOMS, REFUSED
-from support.sandbox_runs import refusal, variables
+from support.random_programs import program
+from support.sandbox_runs import refusal, run, variables
+
+from voxposer.sandbox.syntax import SandboxError
 
 
 @pytest.mark.parametrize("name", IDIOMS)
@@ -42,6 +46,42 @@ def test_a_refused_idiom_says_what_to_write_instead(name: str) -> None:
     error = refusal(source)
     assert error.rule == rule
     assert words in error.reason
+
+
+def test_random_programs_end_as_in_python() -> None:
+    """Where Python gives a result, so does the sandbox, and where Python raises, it refuses; limits aside."""
+    compared = 0
+    for seed in range(400):
+        source = program(seed)
+        expected: dict[str, Any] = {}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python warns of comparisons and calls that such programs make
+            raised = _raised(source, expected)
+        try:
+            found = run(source)
+        except SandboxError as error:
+            if error.rule in ("size", "memory", "steps", "nesting"):
+                continue
+            refused = error.error and error.error.python
+            found = None
+        else:
+            refused = None
+        assert (refused is None) == (raised is None), (source, refused, raised)
+        if refused is not None and raised is not None:
+            assert issubclass(refused, raised) or issubclass(raised, refused), (source, refused, raised)
+        for name in ("a", "b", "c", "log") if found else ():
+            assert repr(found.variables.get(name)) == repr(expected.get(name)), source
+        compared += 1
+    assert compared > 350
+
+
+def _raised(source: str, variables: dict[str, Any]) -> type[BaseException] | None:
+    """The class of the error with which Python ends a program, None for none."""
+    try:
+        exec(source, variables)
+    except Exception as error:
+        return type(error)
+    return None
 
 
 def test_functions_of_a_program_end_with_it() -> None:

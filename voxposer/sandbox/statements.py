@@ -139,14 +139,16 @@ class Statements(Expressions):
         return Returned(scope.program.variables[name])
 
     def _augment(self, node: ast.AugAssign, scope: Scope) -> None:
-        right, symbol = self.eval(node.value, scope), SYMBOLS[type(node.op)]
+        symbol = SYMBOLS[type(node.op)]
         if isinstance(node.target, ast.Name):
             old = self._name(node.target, scope)
+            right = self.eval(node.value, scope)
             self.bind(node.target.id, self._arithmetic(symbol, old, right, in_place=True), scope)
             return
         assert isinstance(node.target, ast.Subscript)
         container, index = self.eval(node.target.value, scope), self.eval(node.target.slice, scope)
         old = indexing.subscript(self._guard, container, index)
+        right = self.eval(node.value, scope)
         indexing.assign(self._guard, container, index, self._arithmetic(symbol, old, right, in_place=True))
 
     def _return(self, node: ast.Return, scope: Scope) -> Returned:
