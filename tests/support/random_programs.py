@@ -19,7 +19,7 @@ _FORMS = (
         "(*[{}], {})[-1]",
         "f'{{a}}-{{b!r:>5}}'",
     ),
-    *("list(g(3))", "list(zip(g(2), {}))", "sorted([{}, {}], key=str)"),
+    *("list(g(3))", "list(map(str, {}))", "sorted([{}, {}], key=str)"),
 )
 _HEAD = """\
 log = []

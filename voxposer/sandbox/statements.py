@@ -4,7 +4,8 @@ In: nodes that ``voxposer.sandbox.syntax`` has checked. Out: what a program or o
 Python generators, so that a function of a program can stop at a ``yield`` and go on later.
 
 An error that a program may catch carries its class (``SandboxError.error``). One without, a limit for example, passes
-every ``except`` and every ``finally``: nothing of the program runs after it.
+every ``except`` and every ``finally``: nothing of the program runs after it. Nor does the ``finally`` of a generator
+that is not run to its end, which in Python the garbage collector runs.
 """
 
 from __future__ import annotations
