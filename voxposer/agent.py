@@ -22,6 +22,7 @@ from functools import partial
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control, PlanControl
+from vecenv.errors import VecenvError
 from vecenv.manipulation.routes import RouteConfig, Stop
 from vecenv.manipulation.world import matrix
 from vecenv.observations import ObjectsSnapshot
@@ -38,7 +39,7 @@ from voxposer.perception.view import Perception
 from voxposer.planning import plan as plans
 from voxposer.planning.config import PlannerConfig
 from voxposer.planning.plan import PlanConfig, PlannedWaypoint, SubtaskPlan
-from voxposer.pushing import PushError, PushingConfig, PushSituation, PushTask
+from voxposer.pushing import PushingConfig, PushSituation
 from voxposer.quaternions import quaternion
 from voxposer.requests import InterfaceError, MotionRequest
 from voxposer.sandbox.guard import HostFault, Limits
@@ -295,10 +296,10 @@ class Agent:
             if isinstance(path, InterfaceError):
                 raise path
             if request.object_centric:
-                slot.enter(Pushing(PushTask(request.movable, perception.grid.world(path)), rest))
+                slot.enter(Pushing(pushing.task_of(request.movable, perception.grid.world(path), perception), rest))
                 return []
             stops = stops_of(request, path, perception, self.config.route, closed=slot.grip.closed)
-        except InterfaceError as error:
+        except VecenvError as error:
             _stop_with(slot, error)
             return []
         if request.kind == "path":
@@ -334,7 +335,7 @@ class Agent:
         assert isinstance(slot.phase, Pushing)
         try:
             return pushing.situation(slot.phase.task, slot.interface.perception, self.config.push)
-        except PushError as error:
+        except VecenvError as error:
             _stop_with(slot, error)
             return None
 

@@ -8,7 +8,7 @@ arguments and defaults are upstream's (huangwl18/VoxPoser, ``interfaces.py``), w
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -22,6 +22,8 @@ from voxposer.quaternions import euler2quat, pointat2quat, qinverse, qmult, quat
 from voxposer.requests import InterfaceError, MotionRequest
 
 T = TypeVar("T")
+# Distances and indices of programs stay below this.
+_FAR = 1e6
 # What programs give to ``execute``: a value, or a function that computes it from the present state.
 Observed = Observation | Callable[[], Observation]
 VoxelMap = npt.ArrayLike | Callable[[], npt.ArrayLike]
@@ -76,6 +78,7 @@ class Interface:
         }
         turning = {"pointat2quat": pointat2quat, "vec2quat": pointat2quat, "euler2quat": euler2quat}
         turning |= {"quat2euler": quat2euler, "qmult": qmult, "qinverse": qinverse}
+        turning |= {"normalize_vector": normalize_vector, "normalize_map": normalize_map}
         return {**{f.__name__: f for f in named}, "set_voxel_by_radius": self.set_voxel_by_radius, **empty, **turning}
 
     # -- looking -------------------------------------------------------------------------------------------------------
@@ -91,6 +94,7 @@ class Interface:
     def cm2index(self, cm: float, direction: npt.ArrayLike) -> Any:
         """Centimetres as voxels along ``"x"``, ``"y"``, ``"z"`` (int), or along a vector [3] (int [3])."""
         size = self.perception.grid.resolution * 100
+        _require_distance(cm, "cm")
         if isinstance(direction, str):
             return int(cm / size[_axis(direction)])
         vector = vector3(direction, "direction")
@@ -99,6 +103,7 @@ class Interface:
     def index2cm(self, index: float, direction: str | None = None) -> float:
         """Voxels as centimetres along an axis, or along the average axis."""
         size = self.perception.grid.resolution * 100
+        _require_distance(index, "index")
         return index * float(size.mean() if direction is None else size[_axis(direction)])
 
     # -- maps ----------------------------------------------------------------------------------------------------------
@@ -152,7 +157,7 @@ class Interface:
         """Ask for a motion of ``movable`` over maps; a map that is not given stays at the present state.
 
         Args:
-            movable: observation, or a function that gives one.
+            movable: what ``detect`` or ``parse_query_obj`` gave: the hand, an object, or a part on a joint.
             affordance_map: 1 at targets, [N, N, N]; without it the hand stays where it is.
             avoidance_map: 0 (free) to 1, [N, N, N].
             rotation_map: wxyz, world frame, [N, N, N, 4].
@@ -160,9 +165,10 @@ class Interface:
             gripper_map: 1 open, 0 closed, [N, N, N].
 
         Raises:
-            InterfaceError: a map of another shape, an affordance map without targets, or an object to push without one.
+            InterfaceError: something else as ``movable``, a map of another shape or with values beyond single
+                precision, an affordance map without targets, an object to push without one, or one that is fixed.
         """
-        seen = _now(movable)
+        seen = _seen(movable)
         name = str(seen["name"])
         object_centric = name.lower() not in HAND_ALIASES
         targets = None if affordance_map is None else self._targets(affordance_map)
@@ -214,15 +220,21 @@ class Interface:
     def _require_pushable(self, name: str, targets: np.ndarray | None) -> None:
         if targets is None:
             raise InterfaceError(f"{name} is to move, but there is no affordance map with its target")
-        if name not in self.perception.snapshot.movable:
+        part = self.perception.snapshot.parts.get(name)
+        if part is not None and part.joint is not None:
+            if part.kind == "knob":
+                raise InterfaceError(f"{name} cannot be pushed: it is turned, so grasp it and turn the hand")
+        elif name not in self.perception.snapshot.movable:
             raise InterfaceError(f"{name} cannot be pushed: it is fixed")
 
     def _map(self, given: VoxelMap, what: str, *tail: int) -> np.ndarray:
         value = np.asarray(_now(given))
         if value.shape != (*self._shape, *tail):
             raise InterfaceError(f"the {what} has shape {value.shape}; expected {(*self._shape, *tail)}")
-        if not np.isfinite(value).all():
-            raise InterfaceError(f"the {what} holds values that are not finite")
+        with np.errstate(over="ignore"):
+            finite = np.isfinite(value.astype(np.float32)).all()
+        if not finite:
+            raise InterfaceError(f"the {what} holds values that are not finite in single precision")
         return value
 
     def _avoidance(self, given: VoxelMap) -> np.ndarray | None:
@@ -243,6 +255,41 @@ class Interface:
 def _now(value: T | Callable[[], T]) -> T:
     """The value, or what it evaluates to now."""
     return cast(T, value() if callable(value) else value)
+
+
+def _seen(movable: Observed) -> Observation:
+    """The observation of what is to be moved."""
+    seen = _now(movable)
+    if isinstance(seen, Observation):
+        return seen
+    if isinstance(seen, Sequence) and not isinstance(seen, str):
+        raise InterfaceError(f"movable: {len(seen)} things; call execute for each of them")
+    kind = type(seen).__name__
+    raise InterfaceError(f"movable: expected an observation from parse_query_obj or detect, got a value of type {kind}")
+
+
+def _require_distance(value: object, what: str) -> None:
+    """Refuse what is no distance in a workspace."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise InterfaceError(f"{what}: expected a number, got a value of type {type(value).__name__}")
+    if not abs(value) < _FAR:  # also what is not a number
+        raise InterfaceError(f"{what}: expected a number between -{_FAR:.0f} and {_FAR:.0f}, got {value:g}")
+
+
+def normalize_vector(x: npt.ArrayLike) -> np.ndarray:
+    """A vector [3], or rows of vectors [N, 3], scaled to length 1; zero for one shorter than 1e-6."""
+    vectors = np.asarray(x, float)
+    if vectors.ndim not in (1, 2):
+        raise InterfaceError(f"normalize_vector takes a vector or rows of vectors, not the shape {vectors.shape}")
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), 0.0)
+
+
+def normalize_map(map: npt.ArrayLike) -> np.ndarray:
+    """A map scaled to 0..1; as it is where all its values are equal."""
+    values = np.asarray(map, float)
+    low, high = float(values.min()), float(values.max())
+    return values if high == low else (values - low) / (high - low)
 
 
 def _folded(volume: npt.ArrayLike, tail: int = 0) -> np.ndarray:

@@ -28,7 +28,10 @@ def plan_paths(
 ) -> list[np.ndarray | InterfaceError]:
     """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path."""
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
-    asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None]
+    jointed = [i for i, (interface, request) in enumerate(wants) if hangs_on_joint(interface.perception, request)]
+    for i in jointed:
+        paths[i] = np.stack([wants[i][1].start, nearest_target(wants[i][1])]).astype(float)
+    asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None and i not in jointed]
     for first in range(0, len(asking), CHUNK):
         chunk = asking[first : first + CHUNK]
         for i, path in zip(chunk, _planned([wants[i] for i in chunk], config, route), strict=True):
@@ -41,7 +44,7 @@ def _planned(
 ) -> list[np.ndarray | InterfaceError]:
     padded = [*wants, *[wants[-1]] * ((1 if len(wants) == 1 else CHUNK) - len(wants))]
     starts = np.stack([start_of(interface, request) for interface, request in padded])
-    obstacles = [obstacle_map(interface.perception, request, route) for interface, request in wants]
+    obstacles, refused = _obstacle_maps(wants, route)
     obstacles += [obstacles[-1]] * (len(padded) - len(wants))
     found = optimize_paths(
         starts,
@@ -52,11 +55,39 @@ def _planned(
     )
     lengths, path, fault = (np.asarray(x) for x in (found.path_length, found.path, found.fault))
     return [
-        path[i, : lengths[i]].astype(float)
+        refused[i]
+        if i in refused
+        else path[i, : lengths[i]].astype(float)
         if lengths[i]
         else InterfaceError(f"no path to the targets: {Fault(int(fault[i])).name.lower().replace('_', ' ')}")
         for i in range(len(wants))
     ]
+
+
+def _obstacle_maps(
+    wants: Sequence[tuple[Interface, MotionRequest]], route: RouteConfig
+) -> tuple[list[np.ndarray], dict[int, InterfaceError]]:
+    """The obstacle map of each request, and the errors of those that have none, by their number."""
+    made: list[np.ndarray] = []
+    refused: dict[int, InterfaceError] = {}
+    for i, (interface, request) in enumerate(wants):
+        try:
+            made.append(obstacle_map(interface.perception, request, route))
+        except InterfaceError as error:
+            refused[i] = error
+            made.append(np.zeros((interface.perception.grid.size,) * 3))
+    return made, refused
+
+
+def hangs_on_joint(perception: Perception, request: MotionRequest) -> bool:
+    """Whether a part is to be pushed: where it can go is up to its joint, so its path is not searched for."""
+    return request.object_centric and request.targets is not None and request.movable in perception.snapshot.parts
+
+
+def nearest_target(request: MotionRequest) -> np.ndarray:
+    """The target voxel that is nearest to the start of a motion, [3]."""
+    found = np.argwhere(np.asarray(request.targets))
+    return found[int(np.linalg.norm(found - request.start, axis=1).argmin())]
 
 
 def start_of(interface: Interface, request: MotionRequest) -> np.ndarray:

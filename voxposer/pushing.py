@@ -3,6 +3,10 @@
 A :class:`PushTask` (the object and its path) and a fresh view of it come in; the stops of one push each go out, for all
 slots that push, in one call of the search. The loop is upstream's (``interfaces.py``, ``execute``): it ends when the
 object is within a centimetre of the end of its path, and waypoints of the path that lie behind it are skipped.
+
+What is pushed may be a part that hangs on a joint: a drawer, a door or its handle. Its path is the joint's, as far as
+the target and the joint's travel allow (:class:`~voxposer.joint_motion.JointMotion`). A joint that is to be pushed to
+its end is pushed a little beyond it, so that it closes.
 """
 
 from __future__ import annotations
@@ -12,12 +16,17 @@ from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
+from scipy.spatial import KDTree
 
 from vecenv.errors import VecenvError
 from vecenv.manipulation.routes import Stop
+from vecenv.observations import PointCloud
+from voxposer.joint_motion import JointMotion
 from voxposer.perception.view import Perception
 from voxposer.planning.push import Push, PushConfig, best_push, push_waypoints
 
+# Largest vertical part of the way of something that level pushes can move.
+_LEVEL = 0.3
 # Pushes searched for at once: one shape, one compilation.
 CHUNK = 8
 
@@ -35,6 +44,8 @@ class PushingConfig:
         starts: distance before the contact at which a push may start, and the slant of the fingers, radians, best
             first. Where the scene behind leaves no room, the hand leans over the object and reaches behind it.
         near: an object this close to the end of its path has arrived.
+        near_end: a joint that is pushed to its end has arrived when this close to it.
+        beyond: a joint is pushed this far beyond its end.
         most: largest number of pushes for one path.
         over_ground: the grip site stays this far above the table.
         reach: horizontal distance from the robot's base that a hand pointing down can reach.
@@ -45,6 +56,7 @@ class PushingConfig:
         detours: angles between that and the straight line, tried in turn to either side, radians.
         facing: smallest cosine between a face and the push against it.
         room: room that the hand needs around it where a push starts.
+        part_margin: surface this close to a pushed part belongs to it.
         body: the closed hand in its own frame (x, y across the fingers, z out of them), lower and upper corners of the
             fingers, the palm, and the wrist, which reaches to either side.
     """
@@ -61,6 +73,8 @@ class PushingConfig:
         (0.03, -0.8),
     )
     near: float = 0.01
+    near_end: float = 0.003
+    beyond: float = 0.02
     most: int = 12
     over_ground: float = 0.02
     reach: float = 0.80
@@ -71,6 +85,7 @@ class PushingConfig:
     detours: tuple[float, ...] = (0.3, 0.6, 0.9, 1.2, 1.5)
     facing: float = 0.3
     room: float = 0.004
+    part_margin: float = 0.015
     body: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = (
         ((-0.0105, -0.027, -0.031), (0.0105, 0.027, 0.0095)),
         ((-0.032, -0.104, -0.14), (0.032, 0.104, -0.031)),
@@ -80,11 +95,13 @@ class PushingConfig:
 
 @dataclass
 class PushTask:
-    """An object that is pushed along a path.
+    """An object or a part that is pushed along a path.
 
     Attributes:
-        name: of the object.
-        way: waypoints of its centre, world frame, metres, [P, 3]; the last is the goal.
+        name: of the object, or of the part.
+        way: waypoints of its centre, world frame, metres, [P, 3]; the last is the goal. Of a part, they are on the way
+            of its joint.
+        joint_goal: of a part, how far its joint is to be open, metres or radians; None for an object.
         cursor: index of the next waypoint.
         pushes: number of pushes so far.
         begun: the object's centre before the latest push and the contact of that push, [3] each.
@@ -93,16 +110,46 @@ class PushTask:
 
     name: str
     way: np.ndarray
+    joint_goal: float | None = None
     cursor: int = 0
     pushes: int = 0
     begun: tuple[np.ndarray, np.ndarray] | None = None
     failed: list[np.ndarray] = field(default_factory=list)
 
 
+def task_of(name: str, path: np.ndarray, perception: Perception) -> PushTask:
+    """The task of pushing an object along a path [P, 3], or a part to where its joint comes nearest to the path's end.
+
+    Raises:
+        PushError: the joint moves up or down, which level pushes do not do.
+    """
+    motion = motion_of(perception, name)
+    if motion is None:
+        return PushTask(name, path)
+    if abs(motion.way[2]) > _LEVEL:
+        raise PushError(f"{name} moves up or down, and pushes are level")
+    goal = motion.value_at(path[-1])
+    return PushTask(name, motion.centres(goal), goal)
+
+
+def cloud_of(perception: Perception, name: str) -> PointCloud:
+    """Surface of an object or a part."""
+    part = perception.snapshot.parts.get(name)
+    return perception.snapshot.objects[name] if part is None else part.cloud
+
+
+def motion_of(perception: Perception, name: str) -> JointMotion | None:
+    """How a part moves, None for an object."""
+    part = perception.snapshot.parts.get(name)
+    return None if part is None or part.joint is None else JointMotion.of(part, part.joint)
+
+
 def arrived(task: PushTask, perception: Perception, config: PushingConfig = PushingConfig()) -> bool:
     """Whether the object is at its goal, or was pushed often enough; waypoints that it has passed are skipped."""
-    centre = perception.snapshot.objects[task.name].points.mean(axis=0)
+    centre = cloud_of(perception, task.name).points.mean(axis=0)
     _learn(task, centre, config)
+    if task.joint_goal is not None:
+        return _joint_arrived(task, perception, config)
     left = (task.way[-1] - centre)[:2]
     if np.linalg.norm(left) <= config.near or task.pushes >= config.most:
         return True
@@ -110,6 +157,18 @@ def arrived(task: PushTask, perception: Perception, config: PushingConfig = Push
     while task.cursor < last and left @ (task.way[task.cursor] - centre)[:2] <= config.near**2:
         task.cursor += 1
     return False
+
+
+def _joint_arrived(task: PushTask, perception: Perception, config: PushingConfig) -> bool:
+    """Whether a part's joint is where it should be: to the millimetre at its end, where the last pushes do little."""
+    motion = motion_of(perception, task.name)
+    assert motion is not None
+    assert task.joint_goal is not None
+    left = motion.metres(task.joint_goal - motion.opened)
+    near = config.near_end if motion.is_end(task.joint_goal) and len(task.failed) < 2 else config.near
+    task.way = motion.centres(task.joint_goal)
+    task.cursor = 0
+    return abs(left) <= near or task.pushes >= config.most
 
 
 def _learn(task: PushTask, centre: np.ndarray, config: PushingConfig) -> None:
@@ -135,6 +194,8 @@ class PushSituation:
         lowest: height below which the grip site must not go, metres.
         free: points at which the hand has room to push, bool [M].
         goal: where to push the centre, [3].
+        ways: of a part, the direction in which each of its points moves, [M, 3]; None for an object.
+        carried: of a part, how far its centre moves for each metre that a point moves, [M, 3]; None for an object.
     """
 
     task: PushTask
@@ -142,6 +203,8 @@ class PushSituation:
     lowest: float
     free: np.ndarray
     goal: np.ndarray
+    ways: np.ndarray | None = None
+    carried: np.ndarray | None = None
 
 
 def situation(task: PushTask, perception: Perception, config: PushingConfig) -> PushSituation:
@@ -152,8 +215,10 @@ def situation(task: PushTask, perception: Perception, config: PushingConfig) -> 
     Raises:
         PushError: the hand has no room to begin any push.
     """
-    centre = perception.snapshot.objects[task.name].points.mean(axis=0)
+    centre = cloud_of(perception, task.name).points.mean(axis=0)
     lowest = perception.scene.ground(centre[:2]) + config.over_ground
+    if task.joint_goal is not None:
+        return _joint_situation(task, perception, lowest, config)
     for cursor in range(task.cursor, len(task.way)):
         free = _touchable(task, perception, task.way[cursor], lowest, config)
         if free.any():
@@ -165,6 +230,22 @@ def situation(task: PushTask, perception: Perception, config: PushingConfig) -> 
             task.cursor = max(task.cursor - 1, 0)
             return PushSituation(task, perception, lowest, free, goal)
     raise PushError(f"the hand has no room to begin a push of {task.name}")
+
+
+def _joint_situation(task: PushTask, perception: Perception, lowest: float, config: PushingConfig) -> PushSituation:
+    """Where a part can be pushed: along its joint, and a little beyond where that ends."""
+    motion = motion_of(perception, task.name)
+    assert motion is not None
+    assert task.joint_goal is not None
+    left = motion.metres(task.joint_goal - motion.opened)
+    sign = 1.0 if left >= 0 else -1.0
+    ways, carried = motion.ways(cloud_of(perception, task.name).points, sign)
+    free = _touchable(task, perception, task.way[-1], lowest, config, ways)
+    if not free.any():
+        raise PushError(f"the hand has no room to begin a push of {task.name} {'open' if sign > 0 else 'shut'}")
+    reach = abs(left) + (config.beyond if motion.is_end(task.joint_goal) else 0.0)
+    goal = motion.centre + sign * min(reach, config.push.max_distance) * motion.way
+    return PushSituation(task, perception, lowest, free, goal, ways, carried)
 
 
 def _detours(centre: np.ndarray, end: np.ndarray, config: PushingConfig) -> list[np.ndarray]:
@@ -185,7 +266,7 @@ def next_pushes(situations: Sequence[PushSituation], config: PushingConfig) -> l
 
 
 def _searched(situations: Sequence[PushSituation], config: PushingConfig) -> list[list[Stop]]:
-    clouds = [situation.perception.snapshot.objects[situation.task.name] for situation in situations]
+    clouds = [cloud_of(situation.perception, situation.task.name) for situation in situations]
     most = max(len(cloud.points) for cloud in clouds)
 
     def stacked(rows: Sequence[np.ndarray]) -> np.ndarray:
@@ -201,12 +282,18 @@ def _searched(situations: Sequence[PushSituation], config: PushingConfig) -> lis
         normals=stacked([cloud.normals for cloud in clouds]),
         touchable=stacked([s.free for s in situations]),
         lowest=_padded(np.array([s.lowest for s in situations]), CHUNK - len(situations)),
+        ways=stacked([_zero_or(s.ways, cloud.points) for s, cloud in zip(situations, clouds, strict=True)]),
+        carried=stacked([_zero_or(s.carried, cloud.points) for s, cloud in zip(situations, clouds, strict=True)]),
     )
     for i, s in enumerate(situations):
         s.task.begun = clouds[i].points.mean(axis=0), np.asarray(push.contact[i], float)
         s.task.pushes += 1
         s.task.cursor = min(s.task.cursor + 1, len(s.task.way) - 1)
     return [_way(i, push, s, config) for i, s in enumerate(situations)]
+
+
+def _zero_or(rows: np.ndarray | None, like: np.ndarray) -> np.ndarray:
+    return np.zeros_like(like) if rows is None else rows.astype(like.dtype)
 
 
 def _way(slot: int, push: Push, situation: PushSituation, config: PushingConfig) -> list[Stop]:
@@ -222,11 +309,19 @@ def _way(slot: int, push: Push, situation: PushSituation, config: PushingConfig)
 
 
 def _touchable(
-    task: PushTask, perception: Perception, target: np.ndarray, lowest: float, config: PushingConfig
+    task: PushTask,
+    perception: Perception,
+    target: np.ndarray,
+    lowest: float,
+    config: PushingConfig,
+    ways: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Points of an object that face away from a target and from which a push to it has room to start, bool [M]."""
-    cloud = perception.snapshot.objects[task.name]
-    ahead = (target - cloud.points) * [1.0, 1.0, 0.0]
+    """Points that face away from a target and from which a push to it has room to start, bool [M].
+
+    ``ways`` are the directions [M, 3] of pushes at them that do not go straight to the target.
+    """
+    cloud = cloud_of(perception, task.name)
+    ahead = (target - cloud.points if ways is None else ways) * [1.0, 1.0, 0.0]
     ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
     rows = np.flatnonzero((cloud.normals * ahead).sum(axis=1) < -config.facing)
     touchable = np.zeros(len(cloud.points), bool)
@@ -266,7 +361,8 @@ def _fits(
     """Whether pushes of an object at ``contacts`` [M, 3] along ``ahead`` [M, 3] have room, bool [M].
 
     ``start`` is the distance before the contact at which the hand starts, and its slant. The whole hand needs room
-    there; on the way to the contact its fingers need room, the pushed object ignored.
+    there; on the way to the contact its fingers need room, the pushed object ignored. A part does not move aside, so
+    the wrist that pushes it must also keep its distance from the robot's base.
     """
     distance, slant = start
     begin = _raised(contacts - distance * ahead, lowest)
@@ -279,6 +375,9 @@ def _fits(
         between = _raised(contacts[free] - share * distance * ahead[free], lowest)
         hit[free] = _meets(others, between, hands[free], config.body[:1], 0.0)
     reach = config.reach - config.slanted_reach * max(np.sin(slant), 0.0)
+    if name in perception.snapshot.parts:
+        wrist = begin - perception.config.wrist_back * hands[:, :, 2] - perception.base
+        hit |= np.linalg.norm(wrist[:, :2], axis=1) < perception.config.nearest
     return ~hit & (np.linalg.norm((begin - perception.base)[:, :2], axis=1) < reach)
 
 
@@ -299,6 +398,10 @@ def _obstacles(
     """Surface above the table within reach of a hand at one of the contacts, [N, 3]."""
     points = np.concatenate([perception.scene.others(*ignored), perception.scene.walls])
     points = points[np.linalg.norm((points - contacts.mean(axis=0))[:, :2], axis=1) < 0.4]
+    for name in ignored:
+        if name in perception.snapshot.parts:
+            part = KDTree(perception.snapshot.parts[name].cloud.points)
+            points = points[part.query(points)[0] > config.part_margin]
     return _thinned(points[points[:, 2] > lowest - config.over_ground + 0.005])
 
 

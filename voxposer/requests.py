@@ -26,7 +26,7 @@ class MotionRequest:
     Attributes:
         kind: ``"path"`` (plan over maps), ``"stay"`` (no affordance: where the hand is) or ``"home"``.
         movable: name of what is to be moved.
-        object_centric: whether that is an object, to be pushed, and not the hand.
+        object_centric: whether that is an object, or a part that hangs on a joint, to be pushed, and not the hand.
         start: voxel from which to plan, [3].
         targets: bool [N, N, N]; None for ``stay`` and ``home``.
         avoidance: float32 [N, N, N] in 0..1, None without.
@@ -49,7 +49,7 @@ class MotionRequest:
 
     def rotation_at(self, voxel: np.ndarray) -> np.ndarray:
         """Rotation wanted at a voxel, unit quaternion wxyz [4]."""
-        quat = self.rotation if self.rotation.ndim == 1 else self.rotation[tuple(voxel)]
+        quat = np.asarray(self.rotation if self.rotation.ndim == 1 else self.rotation[tuple(voxel)], float)
         length = float(np.linalg.norm(quat))
         if length < 1e-6:
             raise InterfaceError("the rotation map holds a quaternion of length zero on the way")

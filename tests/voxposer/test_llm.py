@@ -62,7 +62,7 @@ def test_the_provider_gets_the_whole_request(server: LlmServer, config: LlmConfi
         {
             "model": "local",
             "messages": list(QUESTION),
-            "stop": ["# Query: "],
+            "stop": ["\n# Query: "],
             "max_tokens": 99,
             "temperature": 0.0,
             "seed": 7,
@@ -82,6 +82,30 @@ def test_an_answer_ends_at_the_first_stop_token_wherever_the_provider_stopped(
 ) -> None:
     server.say("x = 1\nobjects = ['a']\n# Query: more.\ny = 2")
     assert Model(config).complete(QUESTION, stop=("# Query: ", "objects =")).text == "x = 1"
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "composer('say \"# Query: more\"')",
+        "x = 1  # Query: what was asked",
+        "    # Query: indented, so no line starts with it",
+        "near_objects = [o for o in names]\nf(objects = near_objects)",
+        "text = 'objects = none'",
+        "x = '\u2028objects = 1'",
+    ],
+)
+def test_a_stop_token_inside_a_line_does_not_end_an_answer(server: LlmServer, config: LlmConfig, program: str) -> None:
+    server.say(f"{program}\n# done")
+    reply = Model(config).complete(QUESTION, stop=("# Query: ", "objects = ", "objects ="))
+    assert reply.text == f"{program}\n# done".strip()
+    assert server.requests[-1]["stop"] == ["\n# Query: ", "\nobjects = ", "\nobjects ="]
+
+
+def test_an_answer_that_begins_with_a_stop_token_is_empty(server: LlmServer, config: LlmConfig) -> None:
+    server.say("# Query: more.\ny = 2")
+    with pytest.raises(ReplyError, match="the answer is empty"):
+        Model(config).complete(QUESTION, stop=("# Query: ",))
 
 
 def test_a_known_model_has_a_price_and_an_unknown_one_none(server: LlmServer, config: LlmConfig) -> None:

@@ -49,6 +49,17 @@ class no_error:
     def __exit__(self, *exception: object) -> None: ...
 
 
+def test_a_map_program_without_ret_val_returns_the_map_it_made(setup: Callable[..., Setup]) -> None:
+    """Two of upstream's own examples end so."""
+    made = "affordance_map = get_empty_affordance_map()\naffordance_map[1, 2, 3] = 1"
+    robot = setup(
+        {("get_affordance_map", "here"): made, ("get_affordance_map", "there"): "m = get_empty_affordance_map()"}
+    )
+    np.testing.assert_array_equal(np.argwhere(robot.lmps.get_affordance_map("here")()), [[1, 2, 3]])
+    with pytest.raises(LmpError, match="returned nothing, not a map"):
+        robot.lmps.get_affordance_map("there")()
+
+
 @pytest.mark.parametrize(
     ("name", "stop"), [("planner", ["# Query: ", "objects = "]), ("composer", ["# Query: ", "objects ="])]
 )
@@ -56,7 +67,7 @@ def test_an_answer_ends_at_the_lmps_own_stop_tokens(setup: Callable[..., Setup],
     robot = setup({(name, "wait"): "x = 1\n# Query: next.\nboom()", (name, "go"): "x = 1\nobjects = ['a']\nboom()"})
     getattr(robot.lmps, name)("wait")
     getattr(robot.lmps, name)("go")
-    assert [request["stop"] for request in robot.server.requests] == [stop, stop]
+    assert [request["stop"] for request in robot.server.requests] == [[f"\n{token}" for token in stop]] * 2
     assert [call.code for call in robot.lmps.trace] == ["x = 1", "x = 1"]
 
 

@@ -2,76 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.hostile_programs import HOSTILE
+from support.hostile_programs import HEAVY, HOSTILE
 from support.paths import TESTS
+from support.sandbox_runs import FUNCTIONS, refusal, run, variables
 
-from voxposer.sandbox.guard import Budget, HostFault, Limits, Record
-from voxposer.sandbox.interpreter import Outcome, parse
+from voxposer.sandbox.guard import Budget, HostFault, Limits
+from voxposer.sandbox.interpreter import parse
 from voxposer.sandbox.syntax import RULES, SandboxError
-
-LIMITS = Limits(steps=200_000, calls=100)
-
-
-class Thing(Record):
-    """An observation with a few fields."""
-
-    def __init__(self, **fields: Any) -> None:
-        self._fields = fields
-
-    def fields(self) -> list[str]:
-        return list(self._fields)
-
-    def __getitem__(self, name: str, /) -> Any:
-        value = self._fields[name]
-        return value.copy() if isinstance(value, np.ndarray) else value
-
-    def __str__(self) -> str:
-        return self._fields["name"]
-
-
-BOWL = Thing(name="bowl", position=np.array([20, 30, 40]), aabb=np.array([[15, 25, 38], [25, 35, 44]]), held=False)
-
-
-def detect(name: str) -> Thing:
-    if name != "bowl":
-        raise KeyError(f"no {name!r}")
-    return BOWL
-
-
-FUNCTIONS = MappingProxyType(
-    {
-        "detect": detect,
-        "get_map": lambda: np.zeros((100, 100, 100)),
-        "get_quats": lambda: np.zeros((100, 100, 100, 4)),
-        "cm2index": lambda cm, axis: int(cm / 2),
-    }
-)
-
-
-def run(source: str, **options: Any) -> Outcome:
-    return parse(source, limits=options.pop("limits", LIMITS)).run(FUNCTIONS, **options)
-
-
-def variables(source: str, **options: Any) -> Mapping[str, Any]:
-    return run(source, **options).variables
-
-
-def refusal(source: str, **options: Any) -> SandboxError:
-    with pytest.raises(SandboxError) as caught:
-        run(source, **options)
-    return caught.value
-
 
 # Hostile programs
 
@@ -92,26 +39,76 @@ def test_every_rule_that_a_program_breaks_is_explained() -> None:
 
 IN_LITTLE_ROOM = """
 import resource, sys
-sys.path[:0] = [{here!r}, {tests!r}]
-import test_sandbox as tests
+sys.path[:0] = [{tests!r}]
+from support import sandbox_runs as tests
+from support.hostile_programs import HOSTILE
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 800 * 2**20,) * 2)
 resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 resource.setrlimit(resource.RLIMIT_NPROC, (0, 0))
-for rule, line, source in tests.HOSTILE:
+for rule, line, source in HOSTILE:
     error = tests.refusal(source)
     assert (error.rule, error.line) == (rule, line), (source[:80], str(error))
-print("all refused", len(tests.HOSTILE))
+print("all refused", len(HOSTILE))
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits an address space as Linux does")
 def test_hostile_programs_are_refused_in_little_memory_without_a_file_or_process(tmp_path: Path) -> None:
-    source = IN_LITTLE_ROOM.format(tests=str(TESTS), here=str(Path(__file__).parent))
+    source = IN_LITTLE_ROOM.format(tests=str(TESTS))
     command = [sys.executable, "-B", "-c", source]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.stdout.strip() == f"all refused {len(HOSTILE)}", done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+NESTING = tuple(source for rule, _, source in HOSTILE if rule == "nesting" and ("f(" in source or "next(g)" in source))
+
+
+@pytest.mark.parametrize("source", NESTING)
+def test_depth_is_refused_before_pythons_own_limit_even_far_down_the_stack(source: str) -> None:
+    def deep(frames: int) -> SandboxError:
+        return deep(frames - 1) if frames else refusal(source)
+
+    assert "recursion" not in deep(300).reason
+
+
+MEASURED = """
+import json, os, resource, sys
+sys.path[:0] = [{tests!r}]
+from support import sandbox_runs as tests
+from support.hostile_programs import HOSTILE
+from support.hostile_programs import HEAVY
+for place, source in enumerate(("x = 1", *HEAVY)):
+    child = os.fork()
+    if not child:
+        try:
+            tests.run(source, limits=tests.Limits())
+        except tests.SandboxError as error:
+            print(json.dumps([place, error.rule]), flush=True)
+        os._exit(0)
+    _, status, used = os.wait4(child, 0)
+    print(json.dumps([place, status, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024]), flush=True)
+"""
+
+
+@pytest.mark.heavy
+@pytest.mark.skipif(sys.platform != "linux", reason="measures a process as Linux does")
+def test_heavy_programs_stay_within_time_and_memory_as_measured_from_outside(tmp_path: Path) -> None:
+    source = MEASURED.format(tests=str(TESTS))
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", source], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    refused = {row[0]: row[1] for row in rows if len(row) == 2}
+    measured = {row[0]: row[1:] for row in rows if len(row) == 4}
+    assert set(refused) == set(range(1, len(HEAVY) + 1))
+    assert set(refused.values()) <= {"steps", "memory", "time", "calls", "nesting", "size"}
+    idle = measured[0][2]
+    for place, (status, seconds, megabytes) in measured.items():
+        assert status == 0, HEAVY[place - 1]  # no signal, no crash
+        assert seconds < Limits().seconds + 2, (HEAVY[place - 1], seconds)
+        assert megabytes - idle < Limits().memory_bytes / 2**20 + 200, (HEAVY[place - 1], megabytes)
 
 
 def test_a_program_is_stopped_at_its_time_limit() -> None:
@@ -302,15 +299,12 @@ def marked(source: str) -> list[list[int]]:
         ("np.array([1, 2, 3])", [1, 2, 3]),
         ("np.array([1.2, 2.9, 300])", [1, 3, 99]),
         ("[1, 2, 3]", [1, 2, 3]),
-        ("(1, 2, np.int64(3))", None),
+        ("(1, 2, np.int64(3))", [1, 2, 3]),
         ("detect('bowl').position", [20, 30, 40]),
     ],
 )
-def test_map_indices_are_rounded_and_clipped(index: str, voxel: list[int] | None) -> None:
-    if voxel is None:
-        assert refusal(f"m = get_map()\nm[{index}] = 1").rule == "names"
-    else:
-        assert marked(f"m[{index}] = 1") == [voxel]
+def test_map_indices_are_rounded_and_clipped(index: str, voxel: list[int]) -> None:
+    assert marked(f"m[{index}] = 1") == [voxel]
 
 
 def test_a_slice_of_a_map_begins_at_its_start_when_asked_to_begin_before_it() -> None:

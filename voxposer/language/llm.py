@@ -2,9 +2,9 @@
 
 In: chat messages, and which model of which provider (any string litellm knows; ``offline/libero``, the default, is the
 rule base in ``voxposer.offline``, no language model, and needs neither key nor network). Out: the text up to the first
-stop token, with its tokens and cost. Calls that fail for a passing reason (429, 5xx, timeouts, lost connections,
-replies that are no JSON) are repeated with growing pauses, or after the pause the server asks for. What no waiting ends
-(a wrong key, an unknown model, no credit) is an error at once, marked as permanent.
+line that starts with a stop token, with its tokens and cost. Calls that fail for a passing reason (429, 5xx, timeouts,
+lost connections, replies that are no JSON) are repeated with growing pauses, or after the pause the server asks for.
+What no waiting ends (a wrong key, an unknown model, no credit) is an error at once, marked as permanent.
 
 Complete replies are kept on disk (``voxposer.language.reply_cache``). The offline writer's replies are kept in memory
 only: they cost nothing, and another version may write others. Threads that ask the same at the same time share one
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
@@ -157,7 +158,8 @@ class Llm:
 
         Args:
             messages: ``role`` and ``content`` each.
-            stop: the answer ends before the first of these; they also go to the provider where it takes them.
+            stop: the answer ends before the first line that starts with one of these; inside a line they mean nothing.
+                With a line feed before them they also go to the provider, where it takes them.
             max_tokens: length of the answer at most.
             temperature: 0 for the likeliest answer.
             note: called with the answer before it is checked.
@@ -289,7 +291,7 @@ class Llm:
             **request["options"],
             model=request["model"],
             messages=request["messages"],
-            stop=request["stop"] or None,
+            stop=[f"\n{token}" for token in request["stop"]] or None,
             max_tokens=request["max_tokens"],
             temperature=request["temperature"],
             timeout=self.config.timeout_s,
@@ -342,6 +344,6 @@ def _tokens(response: Response) -> tuple[int | None, int | None]:
 
 
 def _until(stop: Sequence[str], text: str) -> str:
-    """The text before the first stop token: not every provider stops there by itself."""
-    found = [place for place in (text.find(token) for token in stop) if place >= 0]
-    return text[: min(found, default=len(text))].strip()
+    """The text before the first line that starts with a stop token: not every provider stops there by itself."""
+    found = re.search("^(?:" + "|".join(map(re.escape, stop)) + ")", text, re.MULTILINE) if stop else None
+    return text[: found.start() if found else len(text)].strip()

@@ -37,7 +37,7 @@ from voxposer.language.observations import DynamicObservation, DynamicObservatio
 from voxposer.language.prompts import chat_messages, code_in, lines, load_prompts, query_line, repair_messages
 from voxposer.language.replies import LlmError, Message, NoRuleError, Reply
 from voxposer.sandbox import interpreter as sandbox
-from voxposer.sandbox.guard import Budget, HostFault, Limits, RecordList
+from voxposer.sandbox.guard import Budget, HostFault, Limits, RecordList, kind_of
 from voxposer.sandbox.interpreter import Program
 from voxposer.sandbox.syntax import SandboxError
 
@@ -350,7 +350,11 @@ class Lmps:
         written.program, written.call = repaired.program, repaired.call
 
     def _execute(self, written: _Written, functions: Mapping[str, Callable[..., Any]]) -> Any:
-        """Run a program; its errors are reported as errors of this LMP."""
+        """Run a program; its errors are reported as errors of this LMP.
+
+        Some of upstream's examples for maps end without an assignment to ``ret_val``, and models copy that: the map is
+        then the variable that all of them call by its kind, such as ``affordance_map``.
+        """
         config = written.config
         variables = dict(self._session_variables.get(config.name, {}))
         if config.include_context:
@@ -364,6 +368,8 @@ class Lmps:
             )
         if config.maintain_session:
             self._remember(written, outcome.variables)
+        if outcome.value is None and config.name in MAPS:
+            return outcome.variables.get(config.name.removeprefix("get_"))
         return outcome.value
 
     def _allowed(self, name: str, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
@@ -469,7 +475,9 @@ def _static(value: object) -> Observation | None:
 def _shown(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"an array {list(value.shape)}"
-    return "nothing" if value is None else f"{type(value).__name__} {str(value)[:80]!r}"
+    if isinstance(value, (str, bool, int, float, list, tuple, dict, set)):
+        return f"{type(value).__name__} {str(value)[:80]!r}"
+    return "nothing" if value is None else f"a value of kind {kind_of(value)}"
 
 
 def _start(code: str) -> str:

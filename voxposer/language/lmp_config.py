@@ -41,7 +41,7 @@ class LmpConfig:
 
     Attributes:
         name: the function programs call it by.
-        stop: tokens its answer ends at.
+        stop: tokens that its answer ends at, where a line starts with one.
         max_tokens: length of its answer at most.
         temperature: of the model.
         query_prefix: put before a query.

@@ -46,7 +46,7 @@ class Reply:
     """What a model answered.
 
     Attributes:
-        text: up to the first stop token, stripped; never empty.
+        text: up to the first line that starts with a stop token, stripped; never empty.
         model: the model as the provider names it.
         finish_reason: why it ended, as the provider names it; usually ``stop``.
         prompt_tokens: tokens of the question, None if the provider does not say.

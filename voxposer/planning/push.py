@@ -10,6 +10,9 @@ object moves along with the hand, take the best, push, observe again. Upstream m
 sample and then takes its mean. A translation moves the mean equally, so here a sample takes only a few operations and
 the costs are the same.
 
+What hangs on a joint (a drawer, a door, a handle) moves only as the joint lets it: its pushes go along the way that
+each point moves (``ways``), and the model moves its centre along the joint, not along with the hand.
+
 Three points differ, to suit a real hand. Pushing from further back on the same line predicts the same, so the
 chosen contact is moved to where the hand, coming from behind, first touches. By default directions are level: a hand on
 its way to a target a centimetre lower would press on the table. And by default no distance is negative: upstream's
@@ -122,6 +125,8 @@ def best_push(
     touchable: Shaped[AnyArray, "B M"] | None = None,
     lowest: Num[AnyArray, " B"] | Num[AnyArray, ""] | float | None = None,
     highest: Num[AnyArray, " B"] | Num[AnyArray, ""] | float | None = None,
+    ways: Num[AnyArray, "B M 3"] | None = None,
+    carried: Num[AnyArray, "B M 3"] | None = None,
 ) -> Push:
     """The push that is predicted to bring each object's centre closest to its target.
 
@@ -138,6 +143,9 @@ def best_push(
         lowest: world height below which the hand must not touch, [B] or a number: the table and some clearance.
         highest: world height above which it must not, [B] or a number. Where no point lies between, the contact is
             moved to the nearest height allowed.
+        ways: of what hangs on a joint, the direction in which the joint moves each point towards the target, unit
+            vectors, [B, M, 3]; zero, or None, for what is free: a push of it goes towards the target.
+        carried: with ``ways``, how far its centre moves for each metre that a point is pushed, [B, M, 3].
 
     Returns:
         A push for each slot.
@@ -152,9 +160,11 @@ def best_push(
     low, high = (_heights(limit, default, slots) for limit, default in ((lowest, -jnp.inf), (highest, jnp.inf)))
     usable, free = _usable_and_free(points, valid, touchable)
     points = jnp.where(usable[..., None], points, 0)
-    search = jax.vmap(partial(_search, config=config), in_axes=(0, 0, 0, None if normals is None else 0, 0, 0, 0, 0))
+    way, carry = (jnp.zeros_like(points) if given is None else jnp.asarray(given) for given in (ways, carried))
+    in_axes = (0, 0, 0, None if normals is None else 0, 0, 0, 0, 0, 0, 0)
+    search = jax.vmap(partial(_search, config=config), in_axes=in_axes)
     normals = None if normals is None else jnp.asarray(normals)
-    return search(points, usable, free, normals, target, _keys(key, slots), low, high)
+    return search(points, usable, free, normals, target, _keys(key, slots), low, high, way, carry)
 
 
 def _usable_and_free(
@@ -228,9 +238,11 @@ def _search(
     key: Shaped[Array, ...],
     low: Float[Array, ""],
     high: Float[Array, ""],
+    ways: Num[Array, "M 3"],
+    carried: Num[Array, "M 3"],
     config: PushConfig,
 ) -> Push:
-    """One slot: points [M, 3], which count [M] and may be touched [M], normals or None, target [3], heights."""
+    """One slot: points [M, 3], which count [M] and may be touched [M], normals or None, target [3], heights, joint."""
     across = jnp.array([1.0, 1.0, 0.0]) if config.level else jnp.ones(3)
     centre = points.sum(0) / jnp.maximum(usable.sum(), 1)
     # What is not to be judged is set equal, not left out.
@@ -239,12 +251,18 @@ def _search(
     chosen = _draw(which, free, points[:, 2], low, high, config.num_samples)
     contact = points[chosen]
     contact = contact.at[:, 2].set(jnp.clip(contact[:, 2], low, high))
-    direction = _unit((target[None] - contact) * across[None])
+    way = ways[chosen]
+    jointed = (way != 0).any(-1)
+    direction = jnp.where(jointed[:, None], way, _unit((target[None] - contact) * across[None]))
     distance = jax.random.uniform(
         how_far, (config.num_samples,), minval=config.min_distance, maxval=config.max_distance
     )
     moves = None if normals is None else (normals[chosen] * direction).sum(-1) < 0
     predicted, cost = push_costs(centre, goal, contact, direction, distance, moves)
+    against = jnp.ones_like(jointed) if moves is None else moves
+    with_joint = centre[None] + jnp.where(against, distance, 0)[:, None] * carried[chosen]
+    predicted = jnp.where(jointed[:, None], with_joint, predicted)
+    cost = jnp.where(jointed, safe_norm(predicted - goal[None]), cost)
     best = jnp.argmin(cost)
     behind = _behind(points, usable, contact[best], direction[best], config)
     return Push(

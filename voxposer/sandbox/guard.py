@@ -11,11 +11,14 @@ import contextlib
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 import numpy as np
+
+from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Module, Stream, TypeName, error_class
 
 # Array elements that count as one interpreter step: working on them takes about as long as one node.
 ELEMENTS_A_STEP = 1000
@@ -25,6 +28,22 @@ _STEPS_A_LOOK = 500
 _ITEM_BYTES, _CHARACTER_BYTES = 100, 4
 # Largest number of dimensions of an array: the cost of printing or rolling one grows exponentially with it.
 _DIMENSIONS = 8
+# Bytes counted for a function with its scope, and for a suspended generator.
+FUNCTION_BYTES, STREAM_BYTES = 1000, 4000
+# Characters of a message that comes from elsewhere.
+_MESSAGE = 600
+
+# Rules whose violation is an error that a program may catch, and the class by which it does.
+_CATCHABLE: Mapping[str, type[BaseException]] = MappingProxyType(
+    {
+        "types": TypeError,
+        "value": ValueError,
+        "attributes": AttributeError,
+        "names": NameError,
+        "call": RuntimeError,
+        "raised": Exception,
+    }
+)
 
 
 class Refusal(Exception):
@@ -33,11 +52,13 @@ class Refusal(Exception):
     Attributes:
         rule: short name of the rule, one of ``voxposer.sandbox.syntax.RULES``.
         reason: what the program did, and what is allowed.
+        python: Python's class of the error, by which a program may catch it; None if it may not.
     """
 
-    def __init__(self, rule: str, reason: str) -> None:
+    def __init__(self, rule: str, reason: str, python: type[BaseException] | None = None) -> None:
         super().__init__(f"{reason} [{rule}]")
         self.rule, self.reason = rule, reason
+        self.python = python if python is not None else _CATCHABLE.get(rule)
 
 
 class HostFault(Exception):
@@ -64,13 +85,6 @@ class Opaque:
     """A value of the host that programs can only store and pass to the host's functions."""
 
 
-class DType:
-    """A number type such as ``int`` in ``x.astype(int)``: allowed as an argument, not as a value."""
-
-    def __init__(self, name: str, dtype: type[np.generic]) -> None:
-        self.name, self.dtype = name, dtype
-
-
 @dataclass(frozen=True, kw_only=True)
 class Limits:
     """How much a program may use.
@@ -88,6 +102,9 @@ class Limits:
         items: items of a list, tuple or dictionary, nested ones included.
         text_chars: characters of a string.
         integer_bits: bits of an integer.
+        depth: expressions inside one another while they are evaluated, through calls of a program's own functions and
+            through generators; shared by the programs that one program calls. A simple recursive function may call
+            itself about 35 times.
     """
 
     source_chars: int = 20_000
@@ -101,6 +118,7 @@ class Limits:
     items: int = 10_000
     text_chars: int = 10_000
     integer_bits: int = 63
+    depth: int = 250
 
 
 class Budget:
@@ -112,6 +130,13 @@ class Budget:
         self._programs = limits.programs
         self._unseen = 0
         self._since: float | None = None
+        self.depth = 0
+
+    def deeper(self, levels: int = 1) -> None:
+        """Enter an expression, a call or a generator; whoever entered subtracts the levels again."""
+        self.depth += levels
+        if self.depth > self.limits.depth:
+            raise Refusal("nesting", f"calls and generators more than {self.limits.depth} levels deep")
 
     def step(self, count: int = 1) -> None:
         """Count steps, and check the time every few hundred."""
@@ -178,7 +203,7 @@ class Guard:
         """Refuse an array that would be too large, before it is allocated; its elements count as steps."""
         if len(shape) > _DIMENSIONS:
             raise Refusal("size", f"an array of {len(shape)} dimensions; {_DIMENSIONS} are allowed")
-        elements = math.prod(int(length) for length in shape)
+        elements = math.prod(max(int(length), 1) for length in shape)  # (10**9, 0) is empty, its sums are not
         if elements > self.limits.array_elements:
             raise Refusal("memory", f"an array of {elements} elements; {self.limits.array_elements} are allowed")
         self.require_memory(elements * itemsize)
@@ -208,12 +233,14 @@ class Guard:
         elif isinstance(value, str):
             self.characters(len(value))
             self.hold(len(value) * _CHARACTER_BYTES)
-        elif isinstance(value, (list, tuple, dict)):
+        elif isinstance(value, (list, tuple, dict, set)):
             self.length(len(value))
             self.hold(len(value) * _ITEM_BYTES)
             self.budget.step(len(value) // 100)
         elif type(value) is int:
             self.bits(value.bit_length())
+        elif isinstance(value, (Function, Stream)):
+            self.hold(FUNCTION_BYTES if isinstance(value, Function) else STREAM_BYTES)
         else:
             kind_of(value)
         return value
@@ -226,7 +253,7 @@ class Guard:
                 self.take(item)
         return self.take(value)
 
-    def host(self, name: str, function: Callable[..., Any], *arguments: object, **named: object) -> Any:
+    def host(self, name: str, function: Callable[..., Any], /, *arguments: object, **named: object) -> Any:
         """Call a function of the host, its time not counted.
 
         Raises:
@@ -240,7 +267,7 @@ class Guard:
         except (HostFault, Refusal):  # a nested program exceeded this budget
             raise
         except Exception as error:
-            raise Refusal("call", f"{name}: {type(error).__name__}: {error}") from error
+            raise _host_refusal(name, error) from error
         given = any(value is argument for argument in (*arguments, *named.values()))
         return value if given else self.take_all(value)
 
@@ -258,7 +285,7 @@ class Guard:
         while pending:
             item, depth = pending.pop()
             seen += 1
-            if isinstance(item, (list, tuple, dict)):
+            if isinstance(item, (list, tuple, dict, set)):
                 if depth >= self.limits.nesting or seen + len(pending) + len(item) > self.limits.items + 1:
                     raise Refusal("size", f"lists nested too deep or with more than {self.limits.items} items in all")
                 pending.extend((child, depth + 1) for child in _children(item))
@@ -287,7 +314,22 @@ class Weight:
     kinds: frozenset[str]
 
 
-def _children(container: list[Any] | tuple[Any, ...] | dict[Any, Any]) -> Iterable[Any]:
+def _host_refusal(name: str, error: Exception) -> Refusal:
+    """What a program is told when a given function raised: catchable, unless it is the limit of a nested program."""
+    text = shortened(f"{name}: {type(error).__name__}: {error}")
+    refusal = Refusal("call", text, error_class(error))
+    if hasattr(error, "rule") or error_class(error) is None:
+        refusal.python = None
+    return refusal
+
+
+def shortened(text: str, most: int = _MESSAGE) -> str:
+    """A message of at most so many characters, in one line."""
+    line = " ".join(text[: 4 * most].split())
+    return line if len(line) <= most else f"{line[: most - 3]}..."
+
+
+def _children(container: list[Any] | tuple[Any, ...] | dict[Any, Any] | set[Any]) -> Iterable[Any]:
     return [*container.keys(), *container.values()] if isinstance(container, dict) else container
 
 
@@ -306,12 +348,20 @@ _KINDS: dict[type, str] = {
     list: "list",
     tuple: "tuple",
     dict: "dictionary",
+    set: "set",
     range: "range",
+    Function: "function",
+    Stream: "iterator",
+    Error: "error",
+    ErrorType: "class of errors",
+    DType: "type",
+    TypeName: "type",
 }
 
 
 def kind_of(value: object) -> str:
-    """The kind of a value: number, array, text, list, tuple, dictionary, range, observation, map, None.
+    """The kind of a value: number, array, text, list, tuple, dictionary, set, range, observation, map, function,
+    iterator, error, class of errors, type, None.
 
     Raises:
         Refusal: programs may not hold it.
@@ -325,8 +375,8 @@ def kind_of(value: object) -> str:
     for of_host, name in ((Record, "observation"), (RecordList, "observations"), (Opaque, "map")):
         if isinstance(value, of_host):
             return name
-    if isinstance(value, DType):
-        raise Refusal("values", f"{value.name} is a type: it can be a dtype argument or be called, but is not a value")
+    if isinstance(value, Module):
+        raise Refusal("functions", f"{value.name} is a module: its functions can be called, but it is no value")
     raise Refusal("values", f"{type(value).__name__} is not a kind of value that a program may hold")
 
 

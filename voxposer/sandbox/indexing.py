@@ -1,4 +1,4 @@
-"""Reading and writing places in arrays, lists and dictionaries, with upstream's leniency where an array is a map.
+"""Reading, writing and deleting places in arrays, lists and dictionaries, leniently where an array is a map.
 
 In: a ``Guard``, a value and an index that a program wrote. Out: what is there, or the place changed. What an index
 would select is counted before NumPy gets it: a few integers can ask for terabytes.
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from voxposer.sandbox.guard import ELEMENTS_A_STEP, Guard, RecordList, Refusal, refuse_kind
-from voxposer.sandbox.values import APPENDED_BYTES, array, hashable, integer, number_of, numbers
+from voxposer.sandbox.values import APPENDED_BYTES, hashable, integer, listed, number_of, numbers
 
 
 def subscript(guard: Guard, value: object, index: object) -> Any:
@@ -48,10 +48,26 @@ def assign(guard: Guard, value: object, index: object, item: object) -> None:
         value[hashable(guard, index)] = item
         guard.length(len(value))
         guard.hold(APPENDED_BYTES)
-    elif isinstance(value, list) and not isinstance(index, slice):
+    elif isinstance(value, list) and isinstance(index, slice):
+        items = listed(guard, item)
+        guard.length(len(value) + len(items))
+        guard.hold(len(items) * APPENDED_BYTES)
+        value[index] = items
+    elif isinstance(value, list):
         value[integer(index)] = item
     else:
-        refuse_kind(value, "an array, a dictionary, or one place in a list, to assign to")
+        refuse_kind(value, "an array, a dictionary or a list to assign to")
+
+
+def delete(guard: Guard, value: object, index: object) -> None:
+    """``del value[index]``."""
+    if isinstance(value, dict):
+        del value[hashable(guard, index)]
+    elif isinstance(value, list):
+        guard.budget.step(len(value) // 100)
+        del value[index if isinstance(index, slice) else integer(index)]
+    else:
+        refuse_kind(value, "a list or a dictionary to delete from")
 
 
 def _is_basic(index: object) -> bool:
@@ -70,8 +86,19 @@ def _array_index(guard: Guard, value: np.ndarray, index: object) -> Any:
 
 def _plain_index(guard: Guard, index: object) -> Any:
     if isinstance(index, tuple):
-        return tuple(_plain_index(guard, part) for part in index)
-    return array(guard, index) if isinstance(index, list) else index
+        return tuple(_plain_part(guard, part) for part in index)
+    return _plain_part(guard, index)
+
+
+def _plain_part(guard: Guard, part: object) -> Any:
+    """One part of an index: as it is where NumPy makes a view of it, else as an array, which is counted."""
+    if part is None or part is Ellipsis or isinstance(part, slice):
+        return part
+    if isinstance(part, (bool, np.bool_)):
+        return np.asarray(part)
+    if isinstance(part, (int, np.integer)):
+        return part
+    return np.asarray(numbers(guard, part))
 
 
 def _selected(shape: tuple[int, ...], index: tuple[Any, ...]) -> int:
@@ -83,7 +110,7 @@ def _selected(shape: tuple[int, ...], index: tuple[Any, ...]) -> int:
         if isinstance(part, np.ndarray):
             picks.append((int(np.count_nonzero(part)),) if part.dtype == bool else part.shape)
         elif isinstance(part, slice):
-            rest *= math.prod(shape[axis:end])
+            rest *= max(math.prod(shape[axis:end]), 1)
         axis = end
     return math.prod(np.broadcast_shapes(*picks)) * rest * math.prod(shape[axis:])
 

@@ -15,10 +15,12 @@ import numpy as np
 from voxposer.sandbox.guard import Guard, Refusal, kind_of
 from voxposer.sandbox.values import (
     DTYPES,
+    axis_of,
     broadcast,
     count_of,
     digits_of,
     dtype_of,
+    integer,
     listed,
     number_of,
     numbers,
@@ -27,6 +29,9 @@ from voxposer.sandbox.values import (
 )
 
 Function = Callable[..., Any]
+
+# Rows of a matrix to invert.
+_MATRIX = 100
 
 
 def elementwise(name: str, arity: int) -> Function:
@@ -45,6 +50,10 @@ def elementwise(name: str, arity: int) -> Function:
     return apply
 
 
+# Reductions that need a number at least.
+_OF_SOME = ("mean", "std", "var", "median", "ptp")
+
+
 def reduction(name: str) -> Function:
     """A reduction of NumPy over all axes or one."""
     function = getattr(np, name)
@@ -52,8 +61,10 @@ def reduction(name: str) -> Function:
     def apply(guard: Guard, a: object, axis: object = None, keepdims: object = None) -> Any:
         values = numbers(guard, a)
         broadcast(guard, values)
+        if np.size(values) == 0 and name in _OF_SOME:
+            raise Refusal("value", f"the {name} of no numbers")
         extra = {} if keepdims is None else {"keepdims": bool(keepdims)}
-        return function(values, axis=axis, **extra)
+        return function(values, axis=axis_of(axis), **extra)
 
     return apply
 
@@ -139,12 +150,14 @@ def norm(
     if ord is not None and (kind_of(ord) != "number" or (values.ndim != 1 and not isinstance(axis, (int, np.integer)))):
         raise Refusal("value", "np.linalg.norm takes an order for vectors only")
     broadcast(guard, values)
-    return np.linalg.norm(values, ord=ord, axis=axis, keepdims=bool(keepdims))
+    return np.linalg.norm(values, ord=ord, axis=axis_of(axis), keepdims=bool(keepdims))
 
 
 def cross(guard: Guard, a: object, b: object) -> np.ndarray:
     """``np.cross``."""
-    left, right = numbers(guard, a), numbers(guard, b)
+    left, right = np.asarray(numbers(guard, a)), np.asarray(numbers(guard, b))
+    if left.shape[-1:] != (3,) or right.shape[-1:] != (3,):
+        raise Refusal("value", f"np.cross of shapes {left.shape} and {right.shape}; it takes vectors of 3 numbers")
     broadcast(guard, left, right)
     return np.cross(left, right)
 
@@ -165,7 +178,7 @@ def joining(name: str, with_axis: bool) -> Function:
             raise Refusal("types", f"np.{name} takes arrays{' and axis' if with_axis else ''}")
         parts = [numbers(guard, part) for part in listed(guard, arrays)]
         guard.room((sum(np.size(part) for part in parts),))
-        return function(parts, **options)
+        return function(parts, **{key: axis_of(value) for key, value in options.items()})
 
     if not with_axis:
         return apply
@@ -244,7 +257,8 @@ def rearranging(name: str, *parameters: str) -> Function:
     def apply(guard: Guard, a: object, *values: object, **named: object) -> Any:
         options = dict(zip(parameters, values, strict=False)) | named
         if len(values) > len(parameters) or not set(options) <= set(parameters):
-            raise Refusal("types", f"np.{name} takes an array and {', '.join(parameters)}")
+            raise Refusal("types", f"np.{name} takes an array{''.join(f' and {each}' for each in parameters)}")
+        options = {key: bool(value) if key == "keepdims" else axis_of(value) for key, value in options.items()}
         made = numbers(guard, a)
         broadcast(guard, made)
         return function(made, **options)
@@ -264,14 +278,15 @@ def interp(guard: Guard, x: object, xp: object, fp: object) -> Any:
     """``np.interp``."""
     places, knots, values = (numbers(guard, value) for value in (x, xp, fp))
     broadcast(guard, places)
+    broadcast(guard, knots)
     return np.interp(places, knots, values)
 
 
-def diff(guard: Guard, a: object, axis: SupportsIndex = -1) -> np.ndarray:
+def diff(guard: Guard, a: object, axis: object = -1) -> np.ndarray:
     """``np.diff``."""
     values = numbers(guard, a)
     broadcast(guard, values)
-    return np.diff(values, axis=axis)
+    return np.diff(values, axis=integer(axis))
 
 
 def copy_array(guard: Guard, a: object) -> np.ndarray:
@@ -279,3 +294,89 @@ def copy_array(guard: Guard, a: object) -> np.ndarray:
     values = np.asarray(numbers(guard, a))
     guard.room(values.shape, values.itemsize)
     return values.copy()
+
+
+def tile(guard: Guard, a: object, reps: object) -> np.ndarray:
+    """``np.tile``."""
+    values = np.asarray(numbers(guard, a))
+    times = shape_of(guard, reps)
+    guard.room((values.size, *(max(time, 0) for time in times)))
+    return np.tile(values, times)
+
+
+def repeat(guard: Guard, a: object, repeats: object, axis: object = None) -> np.ndarray:
+    """``np.repeat`` by one number."""
+    values, times = np.asarray(numbers(guard, a)), count_of(repeats)
+    guard.room((values.size, times))
+    return np.repeat(values, times, axis=None if axis is None else integer(axis))
+
+
+def append(guard: Guard, arr: object, values: object, axis: object = None) -> np.ndarray:
+    """``np.append``."""
+    parts = [np.asarray(numbers(guard, part)) for part in (arr, values)]
+    if axis is None:
+        parts = [part.ravel() for part in parts]
+    return joining("concatenate", with_axis=True)(guard, parts, axis=0 if axis is None else axis)
+
+
+def unique(guard: Guard, ar: object, axis: object = None) -> np.ndarray:
+    """``np.unique``, the values alone."""
+    values = np.asarray(numbers(guard, ar))
+    guard.room(values.shape)
+    return np.unique(values, axis=None if axis is None else integer(axis))
+
+
+def isin(guard: Guard, element: object, test_elements: object) -> np.ndarray:
+    """``np.isin``."""
+    values, among = np.asarray(numbers(guard, element)), np.asarray(numbers(guard, test_elements))
+    guard.room((values.size + among.size,))
+    return np.isin(values, among, kind="sort")
+
+
+def swapaxes(guard: Guard, a: object, axis1: object, axis2: object) -> np.ndarray:
+    """``np.swapaxes``."""
+    return np.swapaxes(np.asarray(numbers(guard, a)), integer(axis1), integer(axis2))
+
+
+def average(guard: Guard, a: object, axis: object = None, weights: object = None) -> Any:
+    """``np.average``."""
+    values = numbers(guard, a)
+    given = None if weights is None else np.asarray(numbers(guard, weights))
+    broadcast(guard, values)
+    return np.average(values, axis=axis_of(axis), weights=given)
+
+
+def percentile(guard: Guard, a: object, q: object, axis: object = None) -> Any:
+    """``np.percentile``."""
+    values, shares = np.asarray(numbers(guard, a)), np.asarray(numbers(guard, q))
+    guard.room((values.size, shares.size))
+    return np.percentile(values, shares, axis=axis_of(axis))
+
+
+def inverse(guard: Guard, a: object) -> np.ndarray:
+    """``np.linalg.inv`` of one small matrix."""
+    matrix = np.asarray(numbers(guard, a), float)
+    if matrix.ndim != 2 or len(matrix) > _MATRIX:
+        raise Refusal("size", f"np.linalg.inv takes one matrix of at most {_MATRIX} rows")
+    return np.linalg.inv(matrix)
+
+
+def grid(guard: Guard, index: object, *, sparse: bool) -> Any:
+    """``np.mgrid[index]``, or ``np.ogrid[index]`` where ``sparse``; slices with a start, a stop and a step."""
+    axes = [_grid_axis(guard, part) for part in (index if isinstance(index, tuple) else (index,))]
+    guard.room((len(axes), *(axis.size for axis in axes)) if not sparse else (sum(axis.size for axis in axes),))
+    if not isinstance(index, tuple):
+        return axes[0]
+    made = np.meshgrid(*axes, indexing="ij", sparse=sparse)
+    return tuple(made) if sparse else np.stack(made)
+
+
+def _grid_axis(guard: Guard, part: object) -> np.ndarray:
+    if not isinstance(part, slice) or part.stop is None:
+        raise Refusal("types", "np.mgrid and np.ogrid take slices with an end, such as np.mgrid[0:100, 0:100, 0:100]")
+    return arange(guard, 0 if part.start is None else part.start, part.stop, 1 if part.step is None else part.step)
+
+
+def shape(guard: Guard, a: object) -> tuple[int, ...]:
+    """``np.shape``."""
+    return np.shape(numbers(guard, a))

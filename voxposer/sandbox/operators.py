@@ -13,8 +13,19 @@ from typing import Any
 
 import numpy as np
 
+from voxposer.sandbox.formatting import percent
 from voxposer.sandbox.guard import Guard, Refusal, kind_of, refuse_kind
-from voxposer.sandbox.values import APPENDED_BYTES, broadcast, number_of, numbers, require_power, truth
+from voxposer.sandbox.objects import Stream
+from voxposer.sandbox.values import (
+    APPENDED_BYTES,
+    broadcast,
+    hashable,
+    listed,
+    number_of,
+    numbers,
+    require_power,
+    truth,
+)
 
 # Multiplications of a matrix product that a program may ask for.
 _MULTIPLICATIONS = 10**8
@@ -29,13 +40,30 @@ def arithmetic(guard: Guard, symbol: str, left: object, right: object, in_place:
     """
     if (_numeric(left) and _numeric(right)) or _mixed(left, right):
         return _numeric_operation(guard, symbol, left, right, in_place)
+    if in_place and isinstance(left, list) and symbol in ("+", "*"):
+        return _list_in_place(guard, symbol, left, right)
     if symbol == "+" and isinstance(left, _SEQUENCES) and isinstance(right, _SEQUENCES) and type(left) is type(right):
         _require_length(guard, left, len(left) + len(right))
         guard.hold(len(right) * APPENDED_BYTES)
         return (_IN_PLACE if in_place else _OPERATORS)[symbol](left, right)
     if symbol == "*":
         return _repeated(guard, left, right)
+    if symbol == "%" and isinstance(left, str):
+        return percent(guard, left, right)
+    if isinstance(left, (set, dict)) and type(left) is type(right) and symbol in _UNIONS[type(left)]:
+        return _united(guard, symbol, left, right, in_place)
     raise Refusal("types", f"{kind_of(left)} {symbol} {kind_of(right)}")
+
+
+_UNIONS: dict[type, tuple[str, ...]] = {set: ("|", "&", "-", "^"), dict: ("|",)}
+
+
+def _united(guard: Guard, symbol: str, left: Any, right: Any, in_place: bool) -> Any:
+    """An operation of two sets, or the union of two dictionaries."""
+    guard.length(len(left) + len(right))
+    guard.hold((len(left) + len(right)) * APPENDED_BYTES)
+    guard.budget.step((len(left) + len(right)) // 10)
+    return (_IN_PLACE if in_place else _OPERATORS)[symbol](left, right)
 
 
 def _numeric(value: object) -> bool:
@@ -53,6 +81,19 @@ def _require_length(guard: Guard, like: object, length: int) -> None:
         guard.characters(length)
     else:
         guard.length(length)
+
+
+def _list_in_place(guard: Guard, symbol: str, left: list[Any], right: object) -> list[Any]:
+    """``left += right`` of anything to loop over, and ``left *= right``: the same list, changed."""
+    before = len(left)
+    if symbol == "+":
+        more = listed(guard, right)
+        guard.length(before + len(more))
+        left.extend(more)
+    else:
+        left[:] = _repeated(guard, left, right)
+    guard.hold(max(len(left) - before, 0) * APPENDED_BYTES)
+    return left
 
 
 def _repeated(guard: Guard, left: object, right: object) -> Any:
@@ -127,15 +168,33 @@ def compare(guard: Guard, symbol: str, left: object, right: object) -> Any:
     return _COMPARISONS[symbol](left, right)
 
 
+def _equal(guard: Guard, left: object, right: object) -> Any:
+    """``left == right``, where an array equals what has its shape and its numbers."""
+    if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
+        return isinstance(left, np.ndarray) and isinstance(right, np.ndarray) and np.array_equal(left, right)
+    return left == right
+
+
 def _contains(guard: Guard, container: object, item: object) -> bool:
     if isinstance(container, str) and isinstance(item, str):
         return item in container
     if isinstance(container, range):  # which walks through all of it for anything but an int
         number = number_of(item) if kind_of(item) == "number" else math.nan
         return math.isfinite(number) and number == int(number) and int(number) in container
-    if isinstance(container, (list, tuple, dict)):
-        return item in container
+    if isinstance(container, (dict, set)):
+        return hashable(guard, item) in container
+    if isinstance(container, (list, tuple)):
+        return any(item is each or truth(guard, _equal(guard, each, item)) for each in container)
+    if isinstance(container, Stream):
+        return any(truth(guard, _equal(guard, each, item)) for each in container.items)
+    if isinstance(container, np.ndarray):
+        return truth(guard, (container == numbers(guard, item)).any())
     refuse_kind(container, "a list, a dictionary or text")
+
+
+def power_of(guard: Guard, base: object, exponent: object) -> Any:
+    """``pow(base, exponent)``."""
+    return arithmetic(guard, "**", base, exponent)
 
 
 def unary(guard: Guard, symbol: str, value: object) -> Any:

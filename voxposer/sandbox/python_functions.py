@@ -12,18 +12,25 @@ from typing import Any, SupportsIndex
 import numpy as np
 import numpy.typing as npt
 
-from voxposer.sandbox.guard import Guard, Record, Refusal, kind_of, refuse_kind
+from voxposer.sandbox.guard import Guard, Refusal, refuse_kind
+from voxposer.sandbox.iteration import callable_of
 from voxposer.sandbox.numpy_functions import round_array
+from voxposer.sandbox.objects import DType, Error, ErrorType, TypeName
+from voxposer.sandbox.objects import Function as FunctionValue
 from voxposer.sandbox.operators import arithmetic
 from voxposer.sandbox.values import (
     APPENDED_BYTES,
     broadcast,
+    count_of,
     digits_of,
     dtype_of,
+    hashable,
+    in_set_order,
     integer,
     listed,
     number_of,
     numbers,
+    single_number,
     truth,
 )
 
@@ -33,38 +40,76 @@ Function = Callable[..., Any]
 def comparable(guard: Guard, values: Sequence[Any]) -> list[Any]:
     """Items to put in order: those of one list, or the arguments."""
     items = listed(guard, values[0]) if len(values) == 1 else list(values)
-    guard.weigh(items)
-    for item in items:
-        if isinstance(item, (np.ndarray, Record)):
-            refuse_kind(item, "numbers or text to put in order")
+    _require_comparable(guard, items)
     return items
+
+
+def _require_comparable(guard: Guard, items: list[Any]) -> None:
+    weight = guard.weigh(items)
+    wrong = weight.kinds - {"number", "text", "None"}
+    if wrong:
+        raise Refusal(
+            "types", f"values of kind {', '.join(sorted(wrong))} put in order; give a key=, such as a position"
+        )
+    guard.budget.step(len(items) + weight.characters // 100)
+
+
+def _keyed(guard: Guard, items: list[Any], key: object) -> list[Any]:
+    """What items are put in order by."""
+    if key is None:
+        keys = items
+    else:
+        call = callable_of(key)
+        keys = [_scalar(call(item)) for item in items]
+    _require_comparable(guard, keys)
+    return keys
+
+
+def _scalar(value: Any) -> Any:
+    """The number in an array of one element, so that it can be compared."""
+    return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+
+
+_NO_DEFAULT = object()
 
 
 def extreme(choose: Function) -> Function:
     """``min`` or ``max``."""
 
-    def apply(guard: Guard, *values: object) -> Any:
-        return choose(comparable(guard, values))
+    def apply(guard: Guard, *values: object, key: object = None, default: object = _NO_DEFAULT) -> Any:
+        items = listed(guard, values[0]) if len(values) == 1 else list(values)
+        if not items and default is not _NO_DEFAULT:
+            return default
+        keys = _keyed(guard, items, key)
+        return items[choose(range(len(items)), key=keys.__getitem__)]
 
     return apply
 
 
-def in_order(guard: Guard, value: object, reverse: object = False) -> list[Any]:
+def in_order(guard: Guard, iterable: object, key: object = None, reverse: object = False) -> list[Any]:
     """``sorted``."""
-    return sorted(comparable(guard, (value,)), reverse=truth(guard, reverse))
+    items = listed(guard, iterable)
+    keys = _keyed(guard, items, key)
+    places = sorted(range(len(items)), key=keys.__getitem__, reverse=truth(guard, reverse))
+    return [items[place] for place in places]
 
 
 def summed(guard: Guard, value: object, start: object = 0) -> Any:
     """``sum``."""
     total = start
+    if isinstance(start, str):
+        raise Refusal("types", "sum of text; write ''.join(...)")
     for item in listed(guard, value):
+        guard.budget.step()
         total = guard.take(arithmetic(guard, "+", total, item))
     return total
 
 
 def to_int(guard: Guard, value: object = 0) -> int:
     """``int``."""
-    return int(single_number(value))
+    made = int(single_number(value))
+    guard.bits(made.bit_length())
+    return made
 
 
 def to_float(guard: Guard, value: object = 0) -> float:
@@ -72,11 +117,18 @@ def to_float(guard: Guard, value: object = 0) -> float:
     return float(single_number(value))
 
 
-def single_number(value: object) -> Any:
-    """A number, the only element of an array, or text that says a number."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        return value.item()
-    return value if kind_of(value) in ("number", "text") else refuse_kind(value, "a number")
+def converted(guard: Guard, dtype: DType, *values: object) -> Any:
+    """A number type that is called: ``int(x)``, ``float(x)``, ``bool(x)``, ``np.float32(x)``."""
+    if dtype.name in _PLAIN:
+        return _PLAIN[dtype.name](guard, *values)
+    if len(values) != 1:
+        raise Refusal("types", f"{dtype.name} takes one value")
+    given = numbers(guard, values[0])
+    guard.room(np.shape(given))
+    return np.asarray(given).astype(dtype.dtype)[()]
+
+
+_PLAIN: dict[str, Function] = {"int": to_int, "float": to_float, "bool": lambda guard, value=False: truth(guard, value)}
 
 
 def make_range(guard: Guard, *ends: object) -> range:
@@ -85,16 +137,6 @@ def make_range(guard: Guard, *ends: object) -> range:
     for end in (made.start, made.stop, made.step):
         guard.bits(end.bit_length())
     return made
-
-
-def zipped(guard: Guard, *values: object) -> list[Any]:
-    """``zip``, as a list."""
-    return list(zip(*(listed(guard, value) for value in values), strict=False))
-
-
-def enumerated(guard: Guard, value: object, start: object = 0) -> list[Any]:
-    """``enumerate``, as a list."""
-    return list(enumerate(listed(guard, value), integer(start)))
 
 
 def absolute(guard: Guard, value: object) -> Any:
@@ -110,8 +152,133 @@ def rounded(guard: Guard, value: object, ndigits: object = None) -> Any:
     return round(number_of(value), None if ndigits is None else digits_of(ndigits))
 
 
-def ignored_print(guard: Guard, *values: object) -> None:
+def ignored_print(guard: Guard, *values: object, sep: object = " ", end: object = "", flush: object = False) -> None:
     """Accepted, because models like to print; it goes nowhere."""
+
+
+def is_instance(guard: Guard, value: object, of: object) -> bool:
+    """``isinstance`` of the types that programs can name."""
+    types = of if isinstance(of, tuple) else (of,)
+    return any(_is_of(value, kind) for kind in types)
+
+
+def _is_of(value: object, kind: object) -> bool:
+    if isinstance(kind, ErrorType):
+        return isinstance(value, Error) and issubclass(value.python, kind.python)
+    name = kind.name if isinstance(kind, (DType, TypeName, FunctionValue)) else ""
+    if name not in _TYPES:
+        raise Refusal("types", f"isinstance takes types: {', '.join(_TYPES)}")
+    return isinstance(value, _TYPES[name])
+
+
+_TYPES: dict[str, tuple[type, ...]] = {
+    "int": (int,),
+    "float": (float,),
+    "bool": (bool,),
+    "str": (str,),
+    "list": (list,),
+    "tuple": (tuple,),
+    "dict": (dict,),
+    "set": (set,),
+    "range": (range,),
+    "np.ndarray": (np.ndarray,),
+    "np.integer": (np.integer,),
+    "np.floating": (np.floating,),
+    "np.generic": (np.generic,),
+    "np.number": (np.number,),
+    "np.bool_": (np.bool_,),
+    "np.int64": (np.int64,),
+    "np.int32": (np.int32,),
+    "np.float64": (np.float64,),
+    "np.float32": (np.float32,),
+}
+
+
+def is_callable(guard: Guard, value: object) -> bool:
+    """``callable``."""
+    return isinstance(value, (FunctionValue, DType, ErrorType))
+
+
+def make_dict(guard: Guard, given: object = (), /, **named: object) -> dict[Any, Any]:
+    """``dict``."""
+    made: dict[Any, Any] = {}
+    update_dict(guard, made, given, **named)
+    return made
+
+
+def update_dict(guard: Guard, value: dict[Any, Any], given: object = (), /, **named: object) -> None:
+    """``dict.update``."""
+    pairs = list(given.items()) if isinstance(given, dict) else [listed(guard, pair) for pair in listed(guard, given)]
+    guard.length(len(value) + len(pairs) + len(named))
+    guard.hold((len(pairs) + len(named)) * APPENDED_BYTES)
+    for pair in pairs:
+        if len(pair) != 2:
+            raise Refusal("value", f"{len(pair)} values where a key and a value belong")
+        value[hashable(guard, pair[0])] = pair[1]
+    value.update(named)
+
+
+def make_set(guard: Guard, iterable: object = ()) -> set[Any]:
+    """``set``."""
+    return {hashable(guard, item) for item in listed(guard, iterable)}
+
+
+def set_method(name: str) -> Function:
+    """A method of sets that takes other values to loop over: union and the like."""
+    function = getattr(set, name)
+
+    def apply(guard: Guard, value: set[Any], *others: object) -> Any:
+        given = [make_set(guard, other) for other in others]
+        guard.length(len(value) + sum(len(other) for other in given))
+        guard.budget.step((len(value) + sum(len(other) for other in given)) // 10)
+        return function(value, *given)
+
+    return apply
+
+
+def set_item_method(name: str) -> Function:
+    """A method of sets that takes one item: add, discard, remove."""
+    function = getattr(set, name)
+
+    def apply(guard: Guard, value: set[Any], item: object) -> None:
+        guard.length(len(value) + 1)
+        guard.hold(APPENDED_BYTES)
+        function(value, hashable(guard, item))
+
+    return apply
+
+
+def pop_from_set(guard: Guard, value: set[Any]) -> Any:
+    """``set.pop``: the first in the order of ``iterate``."""
+    if not value:
+        raise Refusal("value", "pop from an empty set", KeyError)
+    item = in_set_order(value)[0]
+    value.discard(item)
+    return item
+
+
+def deep_copy(guard: Guard, value: object) -> Any:
+    """``copy.deepcopy`` of numbers, text, arrays, lists, tuples, dictionaries and sets."""
+    guard.weigh(value)
+    return _copied(guard, value)
+
+
+def shallow_copy(guard: Guard, value: object) -> Any:
+    """``copy.copy``."""
+    if isinstance(value, np.ndarray):
+        return _copied(guard, value)
+    return value.copy() if isinstance(value, (list, dict, set)) else value
+
+
+def _copied(guard: Guard, value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        guard.room(value.shape, value.itemsize)
+        return guard.take(value.copy())
+    if isinstance(value, (list, tuple)):
+        return guard.take(type(value)(_copied(guard, item) for item in value))
+    if isinstance(value, dict):
+        return guard.take({key: _copied(guard, item) for key, item in value.items()})
+    return guard.take(set(value)) if isinstance(value, set) else value
 
 
 def astype(guard: Guard, value: np.ndarray, dtype: object) -> Any:
@@ -167,7 +334,26 @@ def insert_item(guard: Guard, value: list[Any], place: object, item: object) -> 
 
 def pop_item(guard: Guard, value: list[Any], place: object = -1) -> Any:
     """``list.pop``."""
+    guard.budget.step(len(value) // 100)
     return value.pop(integer(place))
+
+
+def clear(guard: Guard, value: Any) -> None:
+    """``clear`` of a list, dictionary or set."""
+    value.clear()
+
+
+def pop_key(guard: Guard, value: dict[Any, Any], key: object, default: object = _NO_DEFAULT) -> Any:
+    """``dict.pop``."""
+    known = hashable(guard, key)
+    return value.pop(known) if default is _NO_DEFAULT else value.pop(known, default)
+
+
+def set_default(guard: Guard, value: dict[Any, Any], key: object, default: object = None) -> Any:
+    """``dict.setdefault``."""
+    guard.length(len(value) + 1)
+    guard.hold(APPENDED_BYTES)
+    return value.setdefault(hashable(guard, key), default)
 
 
 def sequence_method(name: str) -> Function:
@@ -181,16 +367,16 @@ def sequence_method(name: str) -> Function:
     return apply
 
 
-def sort_list(guard: Guard, value: list[Any], reverse: object = False) -> None:
+def sort_list(guard: Guard, value: list[Any], *, key: object = None, reverse: object = False) -> None:
     """``list.sort``."""
-    value[:] = in_order(guard, value, reverse)
+    value[:] = in_order(guard, value, key, reverse)
 
 
-def replace_text(guard: Guard, value: str, old: str, new: str) -> str:
+def replace_text(guard: Guard, value: str, old: str, new: str, count: object = -1) -> str:
     """``str.replace``."""
     found = value.count(require_text(old))
     guard.characters(len(value) + found * len(require_text(new)))
-    return value.replace(old, new)
+    return value.replace(old, new, integer(count))
 
 
 def join_text(guard: Guard, value: str, parts: object) -> str:
@@ -212,18 +398,46 @@ def text_method(name: str, least: int, most: int) -> Function:
     def apply(guard: Guard, value: str, *arguments: object) -> Any:
         if not least <= len(arguments) <= most:
             raise Refusal("types", f".{name}() got {len(arguments)} arguments")
-        return function(value, *(require_text(argument) for argument in arguments))
+        given = [_texts(argument) if name in _SEVERAL else require_text(argument) for argument in arguments]
+        length = sum(len(item) for item in given)
+        guard.budget.step(len(value) * max(length, 1) // _COMPARED_A_STEP)
+        return function(value, *given)
 
     return apply
 
 
-def split_text(guard: Guard, value: str, sep: object = None) -> list[str]:
+# Methods that take a tuple of texts as well, and characters compared that count as one step.
+_SEVERAL = ("startswith", "endswith")
+_COMPARED_A_STEP = 10_000
+
+
+def _texts(value: object) -> str | tuple[str, ...]:
+    return tuple(require_text(item) for item in value) if isinstance(value, tuple) else require_text(value)
+
+
+def padding(name: str) -> Function:
+    """``ljust``, ``rjust``, ``center`` or ``zfill``."""
+    function = getattr(str, name)
+
+    def apply(guard: Guard, value: str, width: object, *fill: object) -> str:
+        guard.characters(count_of(width))
+        return function(value, integer(width), *(require_text(character) for character in fill))
+
+    return apply
+
+
+def split_text(guard: Guard, value: str, sep: object = None, maxsplit: object = -1) -> list[str]:
     """``str.split``."""
     guard.length(len(value))
-    return value.split(None if sep is None else require_text(sep))
+    return value.split(None if sep is None else require_text(sep), integer(maxsplit))
 
 
 def dict_method(name: str) -> Function:
     """``dict.keys``, ``values`` or ``items``, as a list."""
     function: Callable[[Any], Iterable[Any]] = getattr(dict, name)
-    return lambda guard, value: list(function(value))
+
+    def apply(guard: Guard, value: dict[Any, Any]) -> list[Any]:
+        guard.budget.step(len(value) // 10)
+        return list(function(value))
+
+    return apply

@@ -3,9 +3,9 @@
 In: source text. Out: a syntax tree in which every node is allowed, or a ``SandboxError`` that names the line and the
 rule. Everything else is refused before anything runs.
 
-The language: assignment (also to several names, and to places in arrays, lists and dictionaries), arithmetic,
-comparisons, and/or/not, conditional expressions, if, for, while, break, continue, pass, return, lists, tuples,
-dictionaries, list comprehensions, f-strings with plain formats, indexing and slicing, fields of observations, calls.
+The language is Python without classes, decorators, ``with``, ``match``, ``async``, shifts, complex numbers and bytes,
+and with names instead of walks: attributes are read from observations, arrays, modules and errors alone, and imports
+bring nothing but what programs may use anyway (``voxposer.sandbox.vocabulary``).
 """
 
 from __future__ import annotations
@@ -17,23 +17,26 @@ from types import MappingProxyType
 from typing import Any
 
 from voxposer.sandbox.guard import Limits, Refusal
+from voxposer.sandbox.objects import Error
 
 RULES: Mapping[str, str] = MappingProxyType(
     {
         "syntax": "the source is Python of the small language",
-        "imports": "nothing is imported; what a program needs is there",
-        "definitions": "no functions, lambdas or classes",
-        "underscores": "no names that start with an underscore",
-        "formats": "f-strings hold values and plain number formats",
+        "imports": "imports name modules whose functions programs have anyway: numpy, math and those of the prompts",
+        "definitions": "no classes, decorators, coroutines or context managers",
+        "underscores": "no attributes that start with an underscore, and no names that start with two",
+        "formats": "formats are plain: a width and a precision of two digits at most, and no fields or indices",
         "names": "a name is a variable, a given function or one of the vocabulary's",
         "attributes": "attributes are an observation's fields, or an array's shape, ndim, size and T, and only read",
-        "functions": "functions are called by their names and are no values",
-        "values": "values are numbers, text, arrays of numbers, lists, tuples, dictionaries, observations and maps",
+        "functions": "modules are no values, and only functions are called",
+        "values": "values are numbers, text, arrays of numbers, lists, tuples, dictionaries, sets, functions, "
+        "iterators, errors, types, observations and maps",
         "types": "operators and functions get values they are made for",
         "value": "operations have a result",
         "call": "a given function did what it was asked",
+        "raised": "an error that the program raises is caught by it",
         "return": "a program that should return a value does",
-        "nesting": "syntax, calls and lists nest a few levels",
+        "nesting": "syntax, calls, generators and lists nest a few levels",
         "size": "integers, text and lists are small",
         "memory": "arrays are of a map's size, a few at a time",
         "steps": "a program ends after a bounded number of steps",
@@ -50,22 +53,27 @@ class SandboxError(ValueError):
         line: line of the source, from 1.
         rule: the rule it breaks, a key of ``RULES``.
         reason: what was found and what would be right.
+        error: what the program itself may catch; None if it may not, as for limits.
     """
 
-    def __init__(self, line: int, rule: str, reason: str) -> None:
+    def __init__(self, line: int, rule: str, reason: str, error: Error | None = None) -> None:
         super().__init__(f"line {line}: {reason} [rule: {rule}]")
-        self.line, self.rule, self.reason = line, rule, reason
+        self.line, self.rule, self.reason, self.error = line, rule, reason, error
 
 
 # The small language: nodes of the syntax tree that a program may contain.
-_STATEMENTS = (ast.Assign, ast.AugAssign, ast.Expr, ast.If, ast.For, ast.While, ast.Return, ast.Pass)
-_JUMPS = (ast.Break, ast.Continue)
-_EXPRESSIONS = (
-    *(ast.Constant, ast.Name, ast.Attribute, ast.Subscript, ast.Slice, ast.Call, ast.keyword),
-    *(ast.BinOp, ast.UnaryOp, ast.BoolOp, ast.Compare, ast.IfExp),
-    *(ast.List, ast.Tuple, ast.Dict, ast.ListComp, ast.comprehension, ast.JoinedStr, ast.FormattedValue),
+_STATEMENTS = (
+    *(ast.Assign, ast.AugAssign, ast.AnnAssign, ast.Expr, ast.If, ast.For, ast.While, ast.Return, ast.Pass, ast.Delete),
+    *(ast.FunctionDef, ast.Try, ast.ExceptHandler, ast.Raise, ast.Assert, ast.Global, ast.Nonlocal),
+    *(ast.Import, ast.ImportFrom, ast.alias, ast.Break, ast.Continue),
 )
-_CONTEXTS = (ast.Load, ast.Store, ast.boolop, ast.cmpop, ast.unaryop)
+_EXPRESSIONS = (
+    *(ast.Constant, ast.Name, ast.Attribute, ast.Subscript, ast.Slice, ast.Call, ast.keyword, ast.Starred),
+    *(ast.BinOp, ast.UnaryOp, ast.BoolOp, ast.Compare, ast.IfExp, ast.NamedExpr, ast.Lambda, ast.arguments, ast.arg),
+    *(ast.List, ast.Tuple, ast.Dict, ast.Set, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp),
+    *(ast.comprehension, ast.JoinedStr, ast.FormattedValue, ast.Yield, ast.YieldFrom),
+)
+_CONTEXTS = (ast.Load, ast.Store, ast.Del, ast.boolop, ast.cmpop, ast.unaryop)
 SYMBOLS: dict[type[ast.AST], str] = {
     ast.Add: "+",
     ast.Sub: "-",
@@ -94,22 +102,20 @@ SYMBOLS: dict[type[ast.AST], str] = {
     ast.Not: "not",
 }
 _OPERATORS = tuple(SYMBOLS)
-_ALLOWED = _STATEMENTS + _JUMPS + _EXPRESSIONS + _CONTEXTS + _OPERATORS
+_ALLOWED = _STATEMENTS + _EXPRESSIONS + _CONTEXTS + _OPERATORS
 
 _REFUSED: tuple[tuple[tuple[type[ast.AST], ...], str, str], ...] = (
-    ((ast.Import, ast.ImportFrom), "imports", "an import statement; np and the given functions are there without"),
+    ((ast.ClassDef,), "definitions", "a class; write functions, and keep values in dictionaries"),
+    ((ast.With,), "definitions", "a with statement; there is nothing to open or close here, so write its body alone"),
     (
-        (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda, ast.arguments, ast.arg),
+        (ast.AsyncFunctionDef, ast.AsyncFor, ast.AsyncWith, ast.Await),
         "definitions",
-        "a definition of a function or class; write the statements themselves",
+        "a coroutine; nothing runs at the same time here, so write def, for and calls without async and await",
     ),
-    ((ast.GeneratorExp, ast.SetComp, ast.DictComp), "syntax", "only list comprehensions are allowed; put it in [ ]"),
-    ((ast.Yield, ast.YieldFrom, ast.Await), "definitions", "a generator or coroutine"),
+    ((ast.Match,), "syntax", "a match statement; write if, elif and else"),
+    ((ast.TryStar,), "syntax", "except*; write except"),
+    ((ast.LShift, ast.RShift), "syntax", "a shift of bits; multiply or divide by a power of two"),
 )
-
-# A fill character is not allowed, and a width of two digits at most.
-_FORMAT = re.compile(r"[<>^]?[+ ]?0?\d{0,2}(\.\d{1,2})?[dfegs%]?")
-_STARRED = "a starred argument or item; write them out"
 
 
 def checked_tree(source: str, limits: Limits) -> ast.Module:
@@ -121,13 +127,17 @@ def checked_tree(source: str, limits: Limits) -> ast.Module:
     if len(source) > limits.source_chars:
         raise SandboxError(1, "size", f"{len(source)} characters of source; {limits.source_chars} are allowed")
     tree = _tree(source)
+    yields = {id(node.value) for node in ast.walk(tree) if isinstance(node, (ast.Expr, ast.Assign, ast.AnnAssign))}
     for node, line, depth in _walk(tree):
         if depth > limits.nesting:
             raise SandboxError(line, "nesting", f"syntax more than {limits.nesting} levels deep")
         try:
             _check(node)
+            if isinstance(node, (ast.Yield, ast.YieldFrom)) and id(node) not in yields:
+                raise Refusal("syntax", "a yield inside an expression; write it as a statement of its own")
         except Refusal as refusal:
             raise SandboxError(line, refusal.rule, refusal.reason) from None
+    _check_places(tree.body, in_function=False, in_loop=False)
     return tree
 
 
@@ -168,8 +178,6 @@ def _check(node: ast.AST) -> None:
     for types, rule, reason in _REFUSED:
         if isinstance(node, types):
             raise Refusal(rule, reason)
-    if isinstance(node, ast.Starred):
-        raise Refusal("syntax", _STARRED)
     if not isinstance(node, _ALLOWED):
         raise Refusal("syntax", f"{_called(node)} is not part of the language")
     check = _CHECKS.get(type(node))
@@ -183,43 +191,68 @@ def _called(node: ast.AST) -> str:
     return f"a '{words}'"
 
 
+def _check_places(body: Iterable[ast.AST], *, in_function: bool, in_loop: bool) -> None:
+    """Refuse yield outside functions, nonlocal at the top, and break and continue outside loops."""
+    for node in body:
+        if isinstance(node, (ast.Break, ast.Continue)) and not in_loop:
+            raise SandboxError(node.lineno, "syntax", f"'{type(node).__name__.lower()}' outside a loop")
+        if isinstance(node, (ast.Yield, ast.YieldFrom, ast.Nonlocal)) and not in_function:
+            raise SandboxError(node.lineno, "syntax", f"'{type(node).__name__.lower()}' outside a function")
+        if isinstance(node, ast.FunctionDef):
+            _check_places(node.body, in_function=True, in_loop=False)
+        elif isinstance(node, ast.Lambda):
+            _check_places([node.body], in_function=False, in_loop=False)
+        elif isinstance(node, (ast.For, ast.While)):
+            _check_places(node.body, in_function=in_function, in_loop=True)
+            _check_places(node.orelse, in_function=in_function, in_loop=in_loop)
+        else:
+            _check_places(ast.iter_child_nodes(node), in_function=in_function, in_loop=in_loop)
+
+
 def _require_public(name: str) -> None:
+    """Refuse an attribute, or a keyword of a given function, that starts with an underscore."""
     if name.startswith("_") and name != "_":
-        raise Refusal("underscores", f"{name!r}: names that start with an underscore are out of reach")
+        raise Refusal("underscores", f"{name!r}: attributes that start with an underscore are out of reach")
+
+
+def _require_plain(*names: str | None) -> None:
+    """Refuse a name that starts with two underscores: Python's own."""
+    for name in names:
+        if name is not None and name.startswith("__"):
+            raise Refusal("underscores", f"{name!r}: names that start with two underscores are out of reach")
 
 
 def _check_constant(node: ast.Constant) -> None:
     value = node.value
     if value is not Ellipsis and not isinstance(value, (str, bool, int, float, type(None))):
         raise Refusal("values", f"{type(value).__name__} is not a kind of value that a program may hold")
+    if type(value) is int and value.bit_length() > _CONSTANT_BITS:
+        raise Refusal("size", f"an integer of {value.bit_length()} bits; {_CONSTANT_BITS} are allowed")
     if isinstance(value, str) and any("\ud800" <= character <= "\udfff" or character == "\0" for character in value):
         raise Refusal("values", "text with characters that no encoding has")
 
 
-def _check_call(node: ast.Call) -> None:
-    if any(keyword.arg is None for keyword in node.keywords):
-        raise Refusal("syntax", _STARRED)
-    if not isinstance(node.func, (ast.Name, ast.Attribute)):
-        raise Refusal("functions", "only functions and methods with a name can be called")
+def _check_target(target: ast.expr) -> None:
+    if isinstance(target, ast.Attribute):
+        raise Refusal("attributes", f"attribute {target.attr!r} is assigned to; attributes are only read")
+    if isinstance(target, ast.Starred):
+        _check_target(target.value)
 
 
 def _check_targets(targets: Iterable[ast.expr]) -> None:
     for target in targets:
-        if isinstance(target, ast.Attribute):
-            raise Refusal("attributes", f"attribute {target.attr!r} is assigned to; attributes are only read")
         if isinstance(target, ast.Starred):
-            raise Refusal("syntax", _STARRED)
+            raise Refusal("syntax", "a starred name by itself; write it in a list or tuple of names")
+        _check_target(target)
 
 
-def _check_format(node: ast.FormattedValue) -> None:
-    if node.conversion not in (-1, ord("s")):
-        raise Refusal("formats", "a conversion in an f-string; write {value}")
-    if node.format_spec is not None:
-        values = node.format_spec.values if isinstance(node.format_spec, ast.JoinedStr) else [node.format_spec]
-        parts = [value.value for value in values if isinstance(value, ast.Constant)]
-        spec = "".join(str(part) for part in parts)
-        if len(parts) < len(values) or not _FORMAT.fullmatch(spec):
-            raise Refusal("formats", f"the format {spec!r} in an f-string; write one such as .2f or d")
+def _check_group(node: ast.Tuple | ast.List) -> None:
+    if not isinstance(node.ctx, ast.Store):
+        return
+    for target in node.elts:
+        _check_target(target)
+    if sum(isinstance(target, ast.Starred) for target in node.elts) > 1:
+        raise Refusal("syntax", "two starred names; only one can take what is left")
 
 
 def _check_comparison(node: ast.Compare) -> None:
@@ -228,38 +261,49 @@ def _check_comparison(node: ast.Compare) -> None:
             raise Refusal("syntax", "'is' compares with None, True and False only")
 
 
-def _check_loop(node: ast.For | ast.While) -> None:
-    if node.orelse:
-        raise Refusal("syntax", "'else' after a loop is not part of the language")
-    if isinstance(node, ast.For):
-        _check_targets([node.target])
-
-
 def _check_comprehension(node: ast.comprehension) -> None:
     if node.is_async:
-        raise Refusal("definitions", "a generator or coroutine")
+        raise Refusal("definitions", "an asynchronous loop; write for without async")
     _check_targets([node.target])
 
 
-def _check_dict(node: ast.Dict) -> None:
-    if any(key is None for key in node.keys):
-        raise Refusal("syntax", _STARRED)
+def _check_function(node: ast.FunctionDef) -> None:
+    _require_plain(node.name)
+    if node.decorator_list:
+        raise Refusal("definitions", "a decorator; call the function on the value instead")
 
+
+def _check_lambda(node: ast.Lambda) -> None:
+    if any(isinstance(inner, (ast.Yield, ast.YieldFrom)) for inner in ast.walk(node.body)):
+        raise Refusal("syntax", "a yield in a lambda; write def")
+
+
+def _check_names(node: ast.Global | ast.Nonlocal) -> None:
+    _require_plain(*node.names)
+
+
+# Bits of an integer that a source text holds.
+_CONSTANT_BITS = 63
 
 _CHECKS: dict[type[ast.AST], Callable[[Any], None]] = {
-    ast.Name: lambda node: _require_public(node.id),
+    ast.Name: lambda node: _require_plain(node.id),
     ast.Attribute: lambda node: _require_public(node.attr),
     ast.keyword: lambda node: _require_public(node.arg or ""),
+    ast.arg: lambda node: _require_plain(node.arg),
+    ast.alias: lambda node: _require_plain(node.asname),
+    ast.ExceptHandler: lambda node: _require_plain(node.name),
     ast.Constant: _check_constant,
-    ast.Call: _check_call,
     ast.Assign: lambda node: _check_targets(node.targets),
     ast.AugAssign: lambda node: _check_targets([node.target]),
-    ast.Tuple: lambda node: _check_targets(node.elts) if isinstance(node.ctx, ast.Store) else None,
-    ast.List: lambda node: _check_targets(node.elts) if isinstance(node.ctx, ast.Store) else None,
-    ast.FormattedValue: _check_format,
+    ast.AnnAssign: lambda node: _check_targets([node.target]),
+    ast.Delete: lambda node: _check_targets(node.targets),
+    ast.For: lambda node: _check_targets([node.target]),
+    ast.Tuple: _check_group,
+    ast.List: _check_group,
     ast.Compare: _check_comparison,
-    ast.For: _check_loop,
-    ast.While: _check_loop,
     ast.comprehension: _check_comprehension,
-    ast.Dict: _check_dict,
+    ast.FunctionDef: _check_function,
+    ast.Lambda: _check_lambda,
+    ast.Global: _check_names,
+    ast.Nonlocal: _check_names,
 }

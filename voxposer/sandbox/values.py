@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sized
 from types import MappingProxyType
 from typing import Any, SupportsIndex, cast
 
@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from voxposer.sandbox.guard import (
-    DType,
     Guard,
     Opaque,
     Record,
@@ -26,11 +25,12 @@ from voxposer.sandbox.guard import (
     refuse_kind,
     require_numbers,
 )
+from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Stream, TypeName
 
-# Numbers in one piece of text.
-_PRINTED = 1000
 # Largest number of digits for round().
 _DIGITS = 20
+# Axes that one call may name.
+_AXES = 8
 # Bytes counted for an item put into a list.
 APPENDED_BYTES = 16
 
@@ -56,6 +56,8 @@ def numbers(guard: Guard, value: object) -> Any:
     kind = kind_of(value)
     if kind in ("list", "tuple", "range"):
         return array(guard, value)
+    if kind == "iterator":
+        refuse_kind(value, "numbers (write list(...) around an iterator)")
     return value if kind in ("number", "array") else refuse_kind(value, "numbers")
 
 
@@ -99,6 +101,17 @@ def integer(value: object) -> int:
     return operator.index(cast(SupportsIndex, value))
 
 
+def axis_of(value: object) -> int | tuple[int, ...] | None:
+    """An axis, several axes, or a shift along each: an integer, a few of them, or None."""
+    if value is None:
+        return None
+    if isinstance(value, (tuple, list)):
+        if len(value) > _AXES:
+            raise Refusal("size", f"{len(value)} axes; {_AXES} are allowed")
+        return tuple(integer(item) for item in value)
+    return integer(value)
+
+
 def count_of(value: object) -> int:
     """A requested count, at least 0."""
     return max(integer(value), 0)
@@ -109,6 +122,13 @@ def number_of(value: object) -> int | float:
     if kind_of(value) != "number":
         refuse_kind(value, "a number")
     return value.item() if isinstance(value, np.generic) else cast(float, value)
+
+
+def single_number(value: object) -> Any:
+    """A number, the only element of an array, or text that says a number."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        return value.item()
+    return value if kind_of(value) in ("number", "text") else refuse_kind(value, "a number")
 
 
 def digits_of(value: object) -> int:
@@ -131,84 +151,78 @@ def truth(guard: Guard, value: object) -> bool:
     Raises:
         Refusal: it is an array of several elements.
     """
+    kind_of(value)
     if isinstance(value, np.ndarray) and value.size != 1:
         raise Refusal("types", f"an array of {value.size} elements is neither true nor false; use .any() or .all()")
     if isinstance(value, RecordList):
         return length_of(guard, value) > 0
-    return True if isinstance(value, (Record, Opaque)) else bool(value)
+    always = (Record, Opaque, Function, Stream, Error, ErrorType, DType, TypeName)
+    return isinstance(value, always) or bool(value)
 
 
 def hashable(guard: Guard, key: object) -> Any:
-    """A dictionary key: text, a number, None, or a tuple of them."""
-    guard.weigh(key)
-    if not isinstance(key, tuple) and kind_of(key) not in ("text", "number", "None"):
+    """A key or an item of a set: text, a number, None, or a tuple of them."""
+    weight = guard.weigh(key)
+    if isinstance(key, tuple):
+        if not weight.kinds <= {"text", "number", "None"} or _holds_unhashable(key):
+            raise Refusal("types", "a tuple as a key holds text, numbers and None only")
+    elif kind_of(key) not in ("text", "number", "None"):
         refuse_kind(key, "text or a number as the key")
     return key
 
 
-def iterate(guard: Guard, value: object) -> Sequence[Any]:
-    """What a loop over the value runs through; ranges, lists and arrays as they are.
+def _holds_unhashable(key: tuple[Any, ...]) -> bool:
+    return any(
+        isinstance(item, (list, dict, set)) or (isinstance(item, tuple) and _holds_unhashable(item)) for item in key
+    )
+
+
+def iterate(guard: Guard, value: object) -> Iterable[Any]:
+    """What a loop over the value runs through; ranges, lists and arrays as they are, sets in order of size or spelling.
 
     Raises:
         Refusal: nothing to loop over.
     """
+    if isinstance(value, Stream):
+        return value.items
     if isinstance(value, dict):
         return list(value)
+    if isinstance(value, set):
+        return in_set_order(value)
     if isinstance(value, np.ndarray) and value.ndim == 0:
         refuse_kind(value[()], "something to loop over")
     if isinstance(value, RecordList):
         return guard.host("the list of observations", list, value)
     if isinstance(value, (list, tuple, str, range, np.ndarray)):
-        return value  # pyright: ignore[reportReturnType]  (an array is a sequence of its rows)
+        return value
     refuse_kind(value, "something to loop over")
+
+
+def in_set_order(items: set[Any]) -> list[Any]:
+    """The items of a set in an order that is the same in every process: numbers by size, else by spelling."""
+    try:
+        return sorted(items)
+    except TypeError:
+        return sorted(items, key=repr)
 
 
 def listed(guard: Guard, value: object) -> list[Any]:
     """The items of a value as a new list."""
     items = iterate(guard, value)
-    guard.length(len(items))
-    return list(items)
+    if isinstance(items, Sized):
+        guard.length(len(items))
+        return list(items)
+    made: list[Any] = []
+    for item in items:
+        guard.length(len(made) + 1)
+        made.append(item)
+    return made
 
 
 def length_of(guard: Guard, value: object) -> int:
     """``len(value)``."""
     if isinstance(value, RecordList):
         return guard.host("the list of observations", len, value)
-    if isinstance(value, (str, list, tuple, dict, range, np.ndarray)):
+    if isinstance(value, (str, list, tuple, dict, set, range, np.ndarray)):
         return len(value)
     refuse_kind(value, "something with a length")
-
-
-def text(guard: Guard, value: object, spec: str = "") -> str:
-    """``str(value)``, or a number in a format such as ``.2f``; NumPy's numbers look like Python's.
-
-    Raises:
-        Refusal: it would be too long, or a format is given for something other than a number or text.
-    """
-    weight = guard.weigh(value)
-    guard.characters(weight.characters)
-    if weight.numbers > _PRINTED:
-        raise Refusal("size", f"{weight.numbers} numbers as text; {_PRINTED} are allowed")
-    guard.budget.step(weight.numbers)
-    if spec:
-        if kind_of(value) not in ("number", "text"):
-            refuse_kind(value, "a number or text to format")
-        return format(value.item() if isinstance(value, np.generic) else value, spec)
-    made = str(_plain(guard, value))
-    guard.characters(len(made))
-    return made
-
-
-def _plain(guard: Guard, value: object) -> Any:
-    """A value whose ``str`` reveals no more than a program may know, and is the same each time."""
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, (list, tuple)):
-        return type(value)(_plain(guard, item) for item in value)
-    if isinstance(value, dict):
-        return {key: _plain(guard, item) for key, item in value.items()}
-    if isinstance(value, Record):
-        return guard.host("the observation", str, value)
-    if isinstance(value, (RecordList, Opaque)):
-        refuse_kind(value, "something with a text")
-    return value

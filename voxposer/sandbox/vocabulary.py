@@ -12,11 +12,12 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+from voxposer.sandbox import formatting, iteration
 from voxposer.sandbox import numpy_functions as npf
 from voxposer.sandbox import python_functions as pyf
 from voxposer.sandbox.guard import Guard
-from voxposer.sandbox.operators import dot
-from voxposer.sandbox.values import array, hashable, length_of, listed, text, truth
+from voxposer.sandbox.operators import dot, power_of
+from voxposer.sandbox.values import array, hashable, iterate, length_of, listed, number_of, truth
 
 Function = Callable[..., Any]
 
@@ -25,18 +26,21 @@ CONSTANTS: Mapping[str, Any] = MappingProxyType(
 )
 
 
-_UNARY = """abs absolute fabs sqrt square exp log sin cos tan arcsin arccos arctan deg2rad rad2deg radians degrees floor
-ceil rint sign isnan isfinite negative logical_not"""
-_BINARY = """add subtract multiply divide floor_divide maximum minimum arctan2 power mod hypot logical_and logical_or
-logical_xor equal not_equal less less_equal greater greater_equal"""
-_REDUCTIONS = """sum mean min max amin amax std var prod any all median"""
+_UNARY = """abs absolute fabs sqrt cbrt square exp exp2 log log2 log10 sin cos tan sinh cosh tanh arcsin arccos arctan
+deg2rad rad2deg radians degrees floor ceil trunc rint sign isnan isinf isfinite negative logical_not"""
+_BINARY = """add subtract multiply divide true_divide floor_divide maximum minimum fmax fmin arctan2 power mod remainder
+hypot logical_and logical_or logical_xor equal not_equal less less_equal greater greater_equal"""
+_REDUCTIONS = """sum mean min max amin amax std var prod any all median ptp"""
 
 NUMPY: Mapping[str, Function] = MappingProxyType(
     {name: npf.elementwise(name, 1) for name in _UNARY.split()}
     | {name: npf.elementwise(name, 2) for name in _BINARY.split()}
     | {name: npf.reduction(name) for name in _REDUCTIONS.split()}
     | {name: npf.rearranging(name, "axis", "keepdims") for name in ("argmin", "argmax", "count_nonzero")}
-    | {name: npf.rearranging(name, "axis") for name in ("cumsum", "sort", "argsort", "flip", "squeeze", "expand_dims")}
+    | {name: npf.rearranging(name, "axis") for name in ("cumsum", "cumprod", "sort", "argsort", "flip")}
+    | {name: npf.rearranging(name, "axis") for name in ("squeeze", "expand_dims")}
+    | {name: npf.rearranging(name) for name in ("atleast_1d", "flipud", "fliplr", "flatnonzero")}
+    | {name: npf.joining(name, with_axis=False) for name in ("column_stack", "dstack")}
     | {name: npf.closeness(name) for name in ("allclose", "isclose")}
     | {name: npf.positions(name) for name in ("nonzero", "argwhere")}
     | {name: npf.joining(name, with_axis=True) for name in ("concatenate", "stack")}
@@ -71,33 +75,82 @@ NUMPY: Mapping[str, Function] = MappingProxyType(
         "transpose": npf.rearranging("transpose", "axes"),
         "roll": npf.rearranging("roll", "shift", "axis"),
         "diff": npf.diff,
+        "tile": npf.tile,
+        "repeat": npf.repeat,
+        "append": npf.append,
+        "unique": npf.unique,
+        "isin": npf.isin,
+        "swapaxes": npf.swapaxes,
+        "average": npf.average,
+        "percentile": npf.percentile,
+        "shape": npf.shape,
+        "ndim": lambda guard, a: len(npf.shape(guard, a)),
+        "size": lambda guard, a: math.prod(npf.shape(guard, a)),
+        "linalg.inv": npf.inverse,
         "interp": npf.interp,
     }
 )
 
 
+def _of_numbers(function: Function) -> Function:
+    """A function of ``math``, of numbers alone."""
+    return lambda guard, *values: function(*(number_of(value) for value in values))
+
+
+_MATH = """sqrt sin cos tan asin acos atan atan2 sinh cosh tanh floor ceil trunc fabs degrees radians hypot isclose
+isnan isinf isfinite exp log log2 log10 copysign fmod"""
+
+MATH: Mapping[str, Function] = MappingProxyType(
+    {name: _of_numbers(getattr(math, name)) for name in _MATH.split()}
+    | {
+        "pow": lambda guard, x, y: math.pow(number_of(x), number_of(y)),
+        "dist": lambda guard, p, q: math.dist(listed(guard, p), listed(guard, q)),
+        "fsum": lambda guard, seq: math.fsum(listed(guard, seq)),
+    }
+)
+
+COPY: Mapping[str, Function] = MappingProxyType({"copy": pyf.shallow_copy, "deepcopy": pyf.deep_copy})
+
+
+def _any(guard: Guard, iterable: object) -> bool:
+    return any(truth(guard, item) for item in iterate(guard, iterable))
+
+
+def _all(guard: Guard, iterable: object) -> bool:
+    return all(truth(guard, item) for item in iterate(guard, iterable))
+
+
 BUILTINS: Mapping[str, Function] = MappingProxyType(
     {
         "abs": pyf.absolute,
-        "all": lambda guard, value: all(truth(guard, item) for item in listed(guard, value)),
-        "any": lambda guard, value: any(truth(guard, item) for item in listed(guard, value)),
-        "bool": truth,
-        "enumerate": pyf.enumerated,
-        "float": pyf.to_float,
-        "int": pyf.to_int,
+        "all": _all,
+        "any": _any,
+        "callable": pyf.is_callable,
+        "dict": pyf.make_dict,
+        "divmod": lambda guard, a, b: divmod(number_of(a), number_of(b)),
+        "enumerate": iteration.enumerated,
+        "filter": iteration.filtered,
+        "format": lambda guard, value, spec="": formatting.formatted(guard, value, pyf.require_text(spec)),
+        "isinstance": pyf.is_instance,
+        "iter": iteration.make_iterator,
         "len": length_of,
-        "list": lambda guard, value=(): listed(guard, value),
+        "list": lambda guard, iterable=(): listed(guard, iterable),
+        "map": iteration.mapped,
         "max": pyf.extreme(max),
         "min": pyf.extreme(min),
+        "next": iteration.next_item,
+        "pow": lambda guard, base, exp: power_of(guard, base, exp),
         "print": pyf.ignored_print,
         "range": pyf.make_range,
-        "reversed": lambda guard, value: listed(guard, value)[::-1],
+        "repr": formatting.representation,
+        "reversed": iteration.backwards,
         "round": pyf.rounded,
+        "set": pyf.make_set,
         "sorted": pyf.in_order,
-        "str": lambda guard, value="": text(guard, value),
+        "str": lambda guard, value="": formatting.text(guard, value),
         "sum": pyf.summed,
-        "tuple": lambda guard, value=(): tuple(listed(guard, value)),
-        "zip": pyf.zipped,
+        "tuple": lambda guard, iterable=(): tuple(listed(guard, iterable)),
+        "zip": iteration.zipped,
     }
 )
 
@@ -108,7 +161,12 @@ def _transposed(guard: Guard, value: object, *axes: object) -> Any:
 
 
 _SHARED = """min max mean sum std var prod any all argmin argmax argsort cumsum round clip dot squeeze reshape ravel
-nonzero copy"""
+nonzero copy swapaxes repeat ptp"""
+
+_SET_METHODS = """union intersection difference symmetric_difference issubset issuperset isdisjoint update"""
+_TEXT_METHODS = """lower upper title capitalize casefold swapcase splitlines isdigit isdecimal isnumeric isalpha isalnum
+isspace islower isupper"""
+_TEXT_SEARCHES = """startswith endswith count find rfind index rindex partition rpartition removeprefix removesuffix"""
 
 METHODS: Mapping[str, Mapping[str, Function]] = MappingProxyType(
     {
@@ -133,6 +191,7 @@ METHODS: Mapping[str, Mapping[str, Function]] = MappingProxyType(
             "reverse": lambda guard, value: value.reverse(),
             "sort": pyf.sort_list,
             "copy": lambda guard, value: listed(guard, value),
+            "clear": pyf.clear,
         },
         "tuple": {"index": pyf.sequence_method("index"), "count": pyf.sequence_method("count")},
         "dictionary": {
@@ -140,13 +199,28 @@ METHODS: Mapping[str, Mapping[str, Function]] = MappingProxyType(
             "values": pyf.dict_method("values"),
             "items": pyf.dict_method("items"),
             "get": lambda guard, value, key, default=None: value.get(hashable(guard, key), default),
+            "pop": pyf.pop_key,
+            "setdefault": pyf.set_default,
+            "update": pyf.update_dict,
+            "copy": lambda guard, value: dict(value),
+            "clear": pyf.clear,
         },
-        "text": {name: pyf.text_method(name, 0, 0) for name in ("lower", "upper", "title", "capitalize")}
+        "set": {name: pyf.set_item_method(name) for name in ("add", "discard", "remove")}
+        | {name: pyf.set_method(name) for name in _SET_METHODS.split()}
+        | {"pop": pyf.pop_from_set, "copy": lambda guard, value: set(value), "clear": pyf.clear},
+        "text": {name: pyf.text_method(name, 0, 0) for name in _TEXT_METHODS.split()}
         | {name: pyf.text_method(name, 0, 1) for name in ("strip", "lstrip", "rstrip")}
-        | {name: pyf.text_method(name, 1, 1) for name in ("startswith", "endswith", "count", "find")}
-        | {"split": pyf.split_text, "replace": pyf.replace_text, "join": pyf.join_text},
+        | {name: pyf.text_method(name, 1, 1) for name in _TEXT_SEARCHES.split()}
+        | {name: pyf.padding(name) for name in ("ljust", "rjust", "center", "zfill")}
+        | {
+            "split": pyf.split_text,
+            "replace": pyf.replace_text,
+            "join": pyf.join_text,
+            "format": formatting.format_text,
+        },
         "number": {"item": pyf.array_item, "tolist": pyf.tolist, "astype": pyf.astype}
-        | {name: NUMPY[name] for name in ("copy", "round", "clip", "any", "all", "sum", "min", "max", "mean")},
+        | {name: NUMPY[name] for name in ("copy", "round", "clip", "any", "all", "sum", "min", "max", "mean")}
+        | {"is_integer": lambda guard, value: float(number_of(value)).is_integer()},
     }
 )
 ATTRIBUTES: Mapping[str, Function] = MappingProxyType(
@@ -155,5 +229,31 @@ ATTRIBUTES: Mapping[str, Function] = MappingProxyType(
         "ndim": lambda value: value.ndim,
         "size": lambda value: value.size,
         "T": lambda value: value.T,
+    }
+)
+
+# What to write in place of names of Python that programs do not have.
+HINTS: Mapping[str, str] = MappingProxyType(
+    {
+        "type": "; compare with isinstance",
+        "object": "; keep values in dictionaries",
+        "id": "; compare with ==",
+        "hash": "; compare with ==",
+        "getattr": "; read an observation's field as x['name']",
+        "hasattr": "; read an observation's field as x['name'] in try and except",
+        "open": "; programs have no files",
+        "input": "; programs ask nobody",
+        "exit": "; end the program with return",
+        "quit": "; end the program with return",
+        "get_clock_time": "; programs do not see the time, so leave it out",
+        "vars": "; name the variables",
+        "locals": "; name the variables",
+        "globals": "; name the variables",
+        "frozenset": "; write a tuple or a set",
+        "slice": "; write the slice in brackets",
+        "chr": "; write the character",
+        "ord": "; compare the characters",
+        "bytes": "; write text",
+        "complex": "; write two numbers",
     }
 )
