@@ -221,12 +221,19 @@ class Progress(NamedTuple):
     ticks: Int[Array, "B T"]
 
 
-def begin_plan(plan: WaypointPlan, current: Pose) -> Progress:
-    """Progress before the first tick, from the end effector's pose now."""
+def begin_plan(plan: WaypointPlan, reference: Pose) -> Progress:
+    """Progress before the first tick; the servo's reference starts at the end effector, or where an earlier plan left it."""
     shape = plan.valid.shape
     none = jnp.zeros(shape[0], jnp.int32)
     index = _next_valid(plan.valid, none)
-    return Progress(index, none, none, current, jnp.zeros(shape, bool), jnp.zeros(shape, jnp.int32))
+    return Progress(index, none, none, reference, jnp.zeros(shape, bool), jnp.zeros(shape, jnp.int32))
+
+
+def start_reference(current: Pose, carried: Real[AnyArray, "B 7"]) -> Pose:
+    """Where the servo's reference starts: at the end effectors, or at the rows of ``carried`` that are not NaN."""
+    kept = jnp.isfinite(carried).all(-1, keepdims=True)
+    pos, quat = jnp.asarray(current.pos), jnp.asarray(current.quat)
+    return Pose(jnp.where(kept, carried[..., :3], pos), jnp.where(kept, carried[..., 3:], quat))
 
 
 def unfinished(plan: WaypointPlan, progress: Progress) -> Bool[Array, " B"]:
