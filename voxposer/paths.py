@@ -24,25 +24,33 @@ CHUNK = 8
 
 
 def plan_paths(
-    wants: Sequence[tuple[Interface, MotionRequest]], config: PlannerConfig, route: RouteConfig
+    wants: Sequence[tuple[Interface, MotionRequest]],
+    config: PlannerConfig,
+    route: RouteConfig,
+    obstacles: dict[int, np.ndarray] | None = None,
 ) -> list[np.ndarray | InterfaceError]:
-    """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path."""
+    """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path.
+
+    The obstacle maps [N, N, N] that paths were planned on are put into ``obstacles``, if given, by index of request.
+    """
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
     asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None]
     for first in range(0, len(asking), CHUNK):
         chunk = asking[first : first + CHUNK]
-        for i, path in zip(chunk, _planned([wants[i] for i in chunk], config, route), strict=True):
+        maps_of = [obstacle_map(wants[i][0].perception, wants[i][1], route) for i in chunk]
+        for i, path in zip(chunk, _planned([wants[i] for i in chunk], maps_of, config), strict=True):
             paths[i] = path
+        if obstacles is not None:
+            obstacles |= dict(zip(chunk, maps_of, strict=True))
     return paths
 
 
 def _planned(
-    wants: Sequence[tuple[Interface, MotionRequest]], config: PlannerConfig, route: RouteConfig
+    wants: Sequence[tuple[Interface, MotionRequest]], obstacles: Sequence[np.ndarray], config: PlannerConfig
 ) -> list[np.ndarray | InterfaceError]:
     padded = [*wants, *[wants[-1]] * ((1 if len(wants) == 1 else CHUNK) - len(wants))]
     starts = np.stack([start_of(interface, request) for interface, request in padded])
-    obstacles = [obstacle_map(interface.perception, request, route) for interface, request in wants]
-    obstacles += [obstacles[-1]] * (len(padded) - len(wants))
+    obstacles = [*obstacles, *[obstacles[-1]] * (len(padded) - len(wants))]
     found = optimize_paths(
         starts,
         np.stack([np.asarray(request.targets) for _, request in padded]),

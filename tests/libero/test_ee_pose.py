@@ -98,7 +98,7 @@ class TestEePose:
 
     @pytest.mark.parametrize("carry", ["yes", [True, False], 1])
     def test_carry_is_true_or_false_of_each_slot(self, env: LiberoEnv, carry: object) -> None:
-        with pytest.raises(ActionError, match="^carry: .*true or false, or 3 of them"):
+        with pytest.raises(ActionError, match=r"^carry: .*true or false, or 3 of them"):
             env.step_ee_pose([], carry=carry)  # pyright: ignore[reportArgumentType]
 
     def test_slots_that_are_not_named_stand_still(self, env: LiberoEnv) -> None:

@@ -19,8 +19,8 @@ from voxposer.show import EpisodeRecord, layers, parse_task, render_page, save_i
 
 def planned() -> list[PlannedMotion]:
     motions: list[PlannedMotion] = []
-    acting, _ = agent(Obedient(snapshot({"cube_1": box((0.02, 0.02, 0.02), (0.2, 0.1, 0.02))})), ("lift",))
-    acting._on_planned = motions.append
+    env = Obedient(snapshot({"cube_1": box((0.02, 0.02, 0.02), (0.2, 0.1, 0.02))}))
+    acting, _ = agent(env, ("lift",), motions.append)
     acting.step()
     return motions
 

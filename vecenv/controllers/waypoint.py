@@ -222,7 +222,7 @@ class Progress(NamedTuple):
 
 
 def begin_plan(plan: WaypointPlan, reference: Pose) -> Progress:
-    """Progress before the first tick; the servo's reference starts at the end effector, or where an earlier plan left it."""
+    """Progress before the first tick; the servo's reference starts at the end effector unless it is carried on."""
     shape = plan.valid.shape
     none = jnp.zeros(shape[0], jnp.int32)
     index = _next_valid(plan.valid, none)
