@@ -289,7 +289,7 @@ class Runtimes:
             _stop_with(slot, error)
 
     def _end_motion(self, slot: Slot) -> None:
-        """End a motion that may be planned again, if the hand has reached its targets or it was planned often enough."""
+        """End a motion that may be planned again, if the hand has reached its targets or it was planned enough."""
         assert isinstance(slot.phase, Moving)
         targets, perception = slot.requests[0].targets, slot.interface.perception
         assert targets is not None

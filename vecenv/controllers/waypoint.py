@@ -242,14 +242,20 @@ def unfinished(plan: WaypointPlan, progress: Progress) -> Bool[Array, " B"]:
 
 
 def plan_action(
-    plan: WaypointPlan, progress: Progress, current: Pose, config: WaypointConfig = STEP_EE_POSE
+    plan: WaypointPlan,
+    progress: Progress,
+    current: Pose,
+    moves: Bool[AnyArray, " B"],
+    config: WaypointConfig = STEP_EE_POSE,
 ) -> tuple[Float[Array, "B 7"], Progress]:
-    """Action of one tick, [B, 7], and the progress with the servo's new reference."""
+    """Action of one tick, [B, 7], and the progress with the servo's new reference in the slots ``moves``, bool [B]."""
     target, grip, hold = _at_index(plan, progress.index)
     moving, ahead = servo(current, target, grip, progress.reference, config)
     holding = (hold > 0)[:, None]
     action = jnp.where(holding, hold_action(grip), moving)
     reference = Pose(*(jnp.where(holding, now, new) for now, new in zip(current, ahead, strict=True)))
+    parts = zip(reference, progress.reference, strict=True)
+    reference = Pose(*(jnp.where(jnp.asarray(moves)[:, None], new, old) for new, old in parts))
     return action, progress._replace(reference=reference)
 
 

@@ -338,9 +338,10 @@ class Physics(ABC, Generic[G]):
             going = np.asarray(progress.index) < plan.valid.shape[1]
             if max_misses is not None:
                 going &= np.asarray(progress.misses) < max_misses
-            if not (going & loop.going).any():
+            going &= loop.going
+            if not going.any():
                 break
-            actions, progress = follower.action(plan, progress, self.eef())
+            actions, progress = follower.action(plan, progress, self.eef(), going)
             moved = loop.tick(np.asarray(actions), going)
             progress = follower.advance(plan, progress, self.eef(), moved)
         return FollowResult(

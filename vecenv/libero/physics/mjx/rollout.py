@@ -146,7 +146,7 @@ def follow_plan(
     ) -> tuple[Loop, waypoint.Progress, Trace, jax.Array]:
         loop, progress, trace, count = carry
         moved = moving(loop, progress)
-        actions, progress = act(plan, progress, eef(loop.worlds, *sites))
+        actions, progress = act(plan, progress, eef(loop.worlds, *sites), moved)
         loop = _tick(system, table, limit, loop, actions, moved, until_success)
         progress = advance(plan, progress, eef(loop.worlds, *sites), moved)
         if traced:
