@@ -43,6 +43,8 @@ class AgentConfig(RuntimeConfig):
         passes: how often the whole instruction is planned when it was executed to the end without success.
         max_misses: a plan is abandoned after this many waypoints in a row that could not be reached.
         idle_ticks: ticks that stopped slots wait in a round in which no slot has a plan.
+        wait: a slot that is stopped holds still until the environment's budget is spent, and may still be solved by
+            what moves on its own. False ends its episode at once.
         follow: ``"plan"`` executes a whole plan in one call, ``"waypoint"`` one waypoint a call.
     """
 
@@ -51,6 +53,7 @@ class AgentConfig(RuntimeConfig):
     passes: int = 3
     max_misses: int = 2
     idle_ticks: int = 50
+    wait: bool = True
     follow: Following = "plan"
 
     def __post_init__(self) -> None:
@@ -117,6 +120,8 @@ class Agent:
         live = [i for i, slot in enumerate(self.slots) if not self._finished[i] and not slot.cause]
         snapshots = self.env.observe_objects(slots=live).snapshot
         expanded = self._plan(live, snapshots)
+        if not self.config.wait:
+            self.env.end_episodes([i for i in live if self.slots[i].cause])
         if not expanded.plan.valid.any():
             return self._record(self._wait())
         followed = FOLLOW[self.config.follow](self.env, self._with_waiting(expanded), self.config.max_misses)
