@@ -89,8 +89,9 @@ def map_views(motion: PlannedMotion, config: PlannerConfig) -> list[MapView]:
     if motion.obstacles is not None and request.targets is not None:
         with jax.enable_x64(True):
             value = np.asarray(cost_map(jnp.asarray(request.targets), jnp.asarray(motion.obstacles, float), config))
-        avoidance = motion.obstacles
+        avoidance = motion.obstacles if motion.obstacles.any() else None
     unplanned = {"home": "not planned: the hand goes home", "stay": "not planned: the hand stays"}.get(request.kind, "")
+    nothing = "nothing: the hand pushes or pulls, and no program says otherwise"
     turned = None if request.rotation.ndim == 1 else _turned(request.rotation, motion.start[3:])
     quat = ", ".join(f"{part:.2f}" for part in request.rotation) if turned is None else ""
     grip = "" if request.gripper.ndim else ("open everywhere" if request.gripper >= 0.5 else "closed everywhere")
@@ -99,7 +100,7 @@ def map_views(motion: PlannedMotion, config: PlannerConfig) -> list[MapView]:
     assert all(each is None or each.shape == shape for each in (value, avoidance, turned))
     return [
         MapView("value (cost)", value, (0, 1), "Viridis", unplanned),
-        MapView("keep away", avoidance, (0, 1), "Reds", unplanned),
+        MapView("keep away", avoidance, (0, 1), "Reds", unplanned or nothing),
         MapView("rotation, degrees from the hand's", turned, (0, 180), "Cividis", f"wxyz {quat} everywhere"),
         MapView("gripper (1 open)", request.gripper if request.gripper.ndim else None, (0, 1), "Blues", grip),
         MapView("velocity", request.velocity if request.velocity.ndim else None, (0, 1), "Plasma", speed),
@@ -137,13 +138,13 @@ def scene_figure(motion: PlannedMotion, names: Sequence[str]) -> Figure:
     layout = {
         "scene": {
             "aspectmode": "data",
-            "domain": {"x": [0.2, 1]},
-            "camera": {"eye": {"x": 0.95, "y": -0.55, "z": 0.75}, "center": {"x": 0, "y": 0, "z": -0.15}},
+            "domain": {"x": [0.25, 1]},
+            "camera": {"eye": {"x": 1.15, "y": -0.65, "z": 0.95}, "center": {"x": 0, "y": 0, "z": -0.15}},
             **{f"{axis}axis": {"title": {"text": f"{axis}, m"}} for axis in "xyz"},
         },
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "height": 520,
-        "legend": {"itemsizing": "constant", "x": 0, "y": 1},
+        "legend": {"itemsizing": "constant", "x": 0, "y": 1, "font": {"size": 12}},
     }
     return {"data": [trace for trace in data if trace], "layout": layout}
 
@@ -230,13 +231,14 @@ def slices_figure(motion: PlannedMotion, views: Sequence[MapView]) -> Figure | N
     data: list[Figure] = []
     layout: Figure = {"height": 560, "margin": {"l": 45, "r": 10, "t": 40, "b": 60}, "showlegend": False}
     layout["annotations"] = []
-    share, gap = 1 / len(drawn), 0.05
+    share, gap = 1 / max(len(drawn), 3), 0.05
     for column, view in enumerate(drawn):
         assert view.values is not None
         left, right = column * share, (column + 1) * share - (gap if column < len(drawn) - 1 else 0)
         cuts = (((0, 1), view.values[:, :, row[2]].T), ((0, 2), view.values[:, row[1], :].T))
         for line, ((across, up), cut) in enumerate(cuts):
-            axis = 2 * column + line + 1
+            # Plotly calls its first axes x and y, the next ones x2 and y2.
+            axis = str(2 * column + line + 1) if column or line else ""
             x, y = f"x{axis}", f"y{axis}"
             bar = {"x": (left + right) / 2, "len": right - left} if line == 0 else None
             heat = _heat(view, cut, centres[across], centres[up], bar)
@@ -244,11 +246,12 @@ def slices_figure(motion: PlannedMotion, views: Sequence[MapView]) -> Figure | N
             data.append(_trail(way[:, across], way[:, up], x, y))
             data.append(_cross(end[across], end[up], x, y))
             low, high = (0.56, 1.0) if line == 0 else (0.06, 0.46)
-            layout[f"xaxis{axis}"] = {"domain": [left, right], "anchor": y, "title": {"text": "x, m", "standoff": 2}}
             title = {"text": "yz"[line] + ", m", "standoff": 2} if column == 0 else {"text": ""}
-            layout[f"yaxis{axis}"] = {"domain": [low, high], "anchor": x, "title": title, "scaleanchor": x}
-            layout[f"yaxis{axis}"] |= {"constrain": "domain"}
-            layout[f"xaxis{axis}"] |= {"constrain": "domain"}
+            wide, tall = ([float(centres[a][0]), float(centres[a][-1])] for a in (across, up))
+            flat = {"domain": [left, right], "anchor": y, "title": {"text": "x, m", "standoff": 2}, "range": wide}
+            upright = {"domain": [low, high], "anchor": x, "title": title, "range": tall, "scaleanchor": x}
+            layout[f"xaxis{axis}"] = flat | {"constrain": "domain"}
+            layout[f"yaxis{axis}"] = upright | {"constrain": "domain"}
         layout["annotations"].append(_title(view.name, (left + right) / 2))
     return {"data": data, "layout": layout}
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -202,7 +201,7 @@ def render_page(shown: EpisodeRecord) -> str:
         motions_of=motions_of,
         pictures={"ends": _ends(shown)},
         totals=_totals(shown.calls),
-        settings=json.dumps(asdict(shown.config), indent=2, default=str),
+        settings="\n".join(_settings(asdict(shown.config))),
         figures=figures,
         plotly_js=Markup(get_plotlyjs()),
     )
@@ -253,6 +252,17 @@ def _data_url(image: np.ndarray) -> str:
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def _settings(options: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Options as lines ``group.name: value``."""
+    lines: list[str] = []
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            lines += _settings(value, f"{prefix}{name}.")
+        else:
+            lines.append(f"{prefix}{name}: {value}")
+    return lines
 
 
 def _author(model: str) -> str:
