@@ -29,7 +29,8 @@ from voxposer.episode import (
 )
 from voxposer.following import FOLLOW, Following
 from voxposer.language.llm import Llm
-from voxposer.runtime import PlannedMotion, RuntimeConfig, Runtimes
+from voxposer.planned import PlannedMotion
+from voxposer.runtime import RuntimeConfig, Runtimes
 from voxposer.slots import Slot
 
 __all__ = ["Agent", "AgentConfig", "PlannedMotion"]

@@ -1,6 +1,6 @@
 """What there is to see of a planned motion: points, cuts through maps, and figures as plotly takes them.
 
-A :class:`~voxposer.runtime.PlannedMotion` comes in, with the maps that it was planned on; nothing is computed from the
+A :class:`~voxposer.planned.PlannedMotion` comes in, with the maps that it was planned on; nothing is computed from the
 state that the episode reached later. Colours of text, axes and background are left to the page, which knows whether it
 is light or dark.
 """
@@ -18,9 +18,9 @@ import numpy as np
 
 from vecenv.manipulation.world import matrix
 from voxposer.perception.grid import VoxelGrid
+from voxposer.planned import PlannedMotion
 from voxposer.planning.config import PlannerConfig
 from voxposer.planning.planner import cost_map
-from voxposer.runtime import PlannedMotion
 
 Figure: TypeAlias = dict[str, Any]
 # Of objects, in the order of their names; readable on white and on black (after Okabe and Ito, and Tol).

@@ -19,7 +19,8 @@ from vecenv.observations import ObjectsSnapshot
 from voxposer.agent import Agent, AgentConfig
 from voxposer.episode import SUBTASK_BUDGET, SUCCESS
 from voxposer.language.llm import Llm, LlmConfig
-from voxposer.runtime import HandleError, PlannedMotion, RuntimeConfig, Runtimes
+from voxposer.planned import PlannedMotion
+from voxposer.runtime import HandleError, RuntimeConfig, Runtimes
 
 PUSHING = {
     "push": 'composer("push it")\ncomposer("lift up")',
