@@ -187,8 +187,8 @@ def scattered(parts: Sequence[tuple[np.ndarray, Expanded]], count: int, config: 
     """
     width = max([config.lengths, *(part.plan.valid.shape[1] for _, part in parts)])
     plan = stack([[]] * count, replace(config, lengths=width))
-    zeros = np.zeros((4, count), int)
-    whole = Expanded(plan, *zeros, np.zeros(count, bool))
+    identity, n_in, n_out, n_holds = np.zeros((4, count), int)
+    whole = Expanded(plan, identity, n_in, n_out, n_holds, np.zeros(count, bool))
     for rows, part in parts:
         for ours, theirs in zip(whole.plan, part.plan, strict=True):
             ours[rows, : theirs.shape[1]] = theirs
@@ -200,7 +200,7 @@ def scattered(parts: Sequence[tuple[np.ndarray, Expanded]], count: int, config: 
 def _expanded(trajectory: Trajectory, slot: int, closed: bool, config: PlanConfig) -> list[PlannedWaypoint]:
     """The waypoints to follow of one slot, motion by motion."""
     rows: list[PlannedWaypoint] = []
-    steps = np.flatnonzero(trajectory.valid[slot])
+    steps = np.flatnonzero(trajectory.valid[slot]).tolist()
     for _, own in itertools.groupby(steps, key=lambda t: trajectory.motion[slot, t]):
         stops = [_stop(trajectory, slot, t) for t in own]
         waypoints, closed = expand_flips(stops, closed, int(trajectory.subtask[slot]), config)

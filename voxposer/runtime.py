@@ -339,7 +339,7 @@ class Runtimes:
             for row, (i, path) in enumerate(zip(waiting, paths, strict=True)):
                 stops = self._plan_motion(i, slots[i], path, kept.get(row))
                 motions[i] += [stops] if stops else []
-            waiting = [i for i in waiting if isinstance(slots[i].phase, Moving) and not slots[i].phase.iterations]
+            waiting = [i for i in waiting if isinstance(phase := slots[i].phase, Moving) and not phase.iterations]
         self._plan_pushes([slot for slot in slots if isinstance(slot.phase, Pushing)], slots, motions)
         return motions
 

@@ -202,7 +202,7 @@ def test_a_motion_is_planned_no_more_often_than_allowed() -> None:
 @pytest.mark.parametrize("name", ["max_subtasks", "max_waypoints", "num_waypoints_per_plan", "max_plan_iter"])
 def test_budgets_are_positive_and_default_to_those_of_the_method(name: str) -> None:
     with pytest.raises(InvalidInput, match=f"{name} must be at least 1, got 0"):
-        RuntimeConfig(**{name: 0})
+        RuntimeConfig(**cast(Any, {name: 0}))
     wanted = {"max_subtasks": 8, "max_waypoints": 80, "num_waypoints_per_plan": 10_000, "max_plan_iter": 1}
     assert getattr(RuntimeConfig(), name) == wanted[name]
 

@@ -72,6 +72,7 @@ def test_the_maps_are_those_that_were_planned_on() -> None:
     value, avoidance, rotation, gripper, velocity = map_views(motion, PlannerConfig())
     assert avoidance.values is motion.obstacles
     assert value.values is not None
+    assert motion.request.targets is not None
     target = tuple(np.argwhere(motion.request.targets)[0])
     assert value.values[target] == pytest.approx(value.values.min(), abs=0.05)
     assert gripper.constant == "open everywhere"
