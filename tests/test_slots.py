@@ -61,7 +61,10 @@ class Scripted(SlotBatch):
     def _failures(self) -> Mapping[int, str]:
         return self.failures
 
-    def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _drive(
+        self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray, carry: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        del carry
         return self._book(moves & ~self.done, np.zeros(self.num_envs, bool)), np.ones(self.num_envs, bool)
 
     def _follow(self, plan: Any, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

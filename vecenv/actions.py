@@ -144,6 +144,35 @@ def ee_poses(value: object, num_envs: int) -> tuple[np.ndarray, np.ndarray, tupl
     return clean, finite & unit, errors
 
 
+# Keys of an action of ``step_ee_pose`` that is a mapping.
+_EE_POSE_KEYS = ("pose", "hold_steps", "carry", "slots")
+
+
+def ee_pose_fields(value: object) -> Mapping[str, object]:
+    """The arguments that an action of ``step_ee_pose`` gives: those of a mapping, or the poses alone.
+
+    Raises:
+        ActionError: a mapping with another key.
+    """
+    if not isinstance(value, Mapping):
+        return {"pose": value}
+    if unknown := [key for key in value if key not in _EE_POSE_KEYS]:
+        raise ActionError(f"poses: unknown key {unknown[0]!r}; expected {', '.join(_EE_POSE_KEYS)}")
+    return value
+
+
+def flags(value: object, num_envs: int, name: str) -> np.ndarray:
+    """Validate one true or false, or one a slot; returns bool [B].
+
+    Raises:
+        ActionError: anything else.
+    """
+    array = np.asarray(value)
+    if array.dtype != bool or array.shape not in ((), (num_envs,)):
+        raise ActionError(f"{name}: got {value!r}; expected true or false, or {num_envs} of them")
+    return np.broadcast_to(array, num_envs).copy()
+
+
 def plan(value: object, num_envs: int) -> tuple[WaypointPlan, tuple[str, ...]]:
     """Validate the input of ``step_waypoints``.
 

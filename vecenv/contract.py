@@ -238,9 +238,17 @@ class BatchEnv(Protocol):
         ...
 
     def step_ee_pose(
-        self, poses: npt.ArrayLike | Mapping[str, object] | None, hold_steps: npt.ArrayLike = 0
+        self,
+        poses: npt.ArrayLike | Mapping[str, object] | None,
+        hold_steps: npt.ArrayLike = 0,
+        *,
+        carry: npt.ArrayLike = False,
+        slots: npt.ArrayLike | None = None,
     ) -> EePoseControl:
-        """Drive the end effectors to absolute poses, [B, 8]."""
+        """Drive the end effectors to absolute poses, [B, 8]; of ``slots`` only, if given.
+
+        ``carry`` goes on with the motion of the last such call without slowing down.
+        """
         ...
 
     def step_waypoints(self, plan: object, max_misses: int | None = None) -> PlanControl:

@@ -74,8 +74,12 @@ class SlotBatch(ABC):
         """Slot -> why its physics failed; healthy slots are left out."""
 
     @abstractmethod
-    def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _drive(
+        self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray, carry: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Drive the slots ``moves`` (bool [B]) to ``targets`` [B, 8], or hold them for ``hold`` ticks (int [B]).
+
+        The servo goes on in the slots ``carry`` (bool [B]) where the last call left it.
 
         Returns:
             Rewards [B], and which slots reached their target, bool [B].
@@ -261,7 +265,12 @@ class SlotBatch(ABC):
     # -- stepping ------------------------------------------------------------------------------------------------------
 
     def step_ee_pose(
-        self, poses: npt.ArrayLike | Mapping[str, object] | None, hold_steps: npt.ArrayLike = 0
+        self,
+        poses: npt.ArrayLike | Mapping[str, object] | None,
+        hold_steps: npt.ArrayLike = 0,
+        *,
+        carry: npt.ArrayLike = False,
+        slots: npt.ArrayLike | None = None,
     ) -> EePoseControl:
         """Drive each end effector to an absolute pose, or hold it while the gripper moves.
 
@@ -271,19 +280,29 @@ class SlotBatch(ABC):
 
         Args:
             poses: [B, 8] xyz (metres), wxyz, grip (1 closed, 0 open), world frame; empty for a no-op. Also a mapping
-                with ``pose`` and ``hold_steps``.
+                with ``pose``, ``hold_steps``, ``carry`` and ``slots``, all but the first optional.
             hold_steps: ticks to hold, one number or [B].
+            carry: go on with the motion of the last ``step_ee_pose`` or ``step_waypoints`` without slowing down, bool
+                or bool [B]. The servo's reference, which leads the hand by up to 25 mm, then stays where that call
+                left it, and waypoints followed one call each take the ticks of one ``step_waypoints``. Without it, and
+                after any other kind of step, the reference starts at the hand. SIMPLER's servo always carries on.
+            slots: drive these only, bool [B] or indices; the others stand still. None: all.
 
         Raises:
-            ActionError: not numbers, or another shape.
+            ActionError: not numbers, another shape, or another key.
+            PlacementError: ``slots`` that do not exist.
         """
         self._check_live()
-        given: Mapping[str, object] = poses if isinstance(poses, Mapping) else {"pose": poses}
-        targets, moves, errors = action_space.ee_poses(given.get("pose", ()), self.num_envs)
-        hold = action_space.hold_steps(given.get("hold_steps", hold_steps), self.num_envs)
+        given: dict[str, Any] = {"pose": (), "hold_steps": hold_steps, "carry": carry, "slots": slots}
+        given |= action_space.ee_pose_fields(poses)
+        targets, moves, errors = action_space.ee_poses(given["pose"], self.num_envs)
+        hold = action_space.hold_steps(given["hold_steps"], self.num_envs)
+        carries = action_space.flags(given["carry"], self.num_envs, "carry")
+        if given["slots"] is not None:
+            moves = moves & np.isin(np.arange(self.num_envs), self.slot_indices(given["slots"]))
         before = self._steps.copy()
         with self._stepping():
-            reward, arrived = self._drive(targets, hold, moves)
+            reward, arrived = self._drive(targets, hold, moves, carries)
         return self._control(
             EePoseControl,
             reward,

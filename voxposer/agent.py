@@ -1,12 +1,10 @@
 """The method as a whole, for a batch: language in, each subtask planned on fresh ground truth and executed.
 
 An environment that speaks ``vecenv.contract`` and an :class:`~voxposer.language.llm.Llm` come in. In each round
-(:meth:`Agent.step`) every slot that has a subtask left plans it on one frozen snapshot: the composer's program asks for
-motions, the planner turns the value maps of all slots into paths in one call, and one ``env.step_waypoints`` executes
-all plans. Objects that are to be moved without a grasp are pushed, one push a round. A slot whose program fails, or for
-which there is no path, is stopped with its cause (``voxposer.slots``) and holds still; the other slots continue. A slot
-whose questions the model does not answer ends at once, without a verdict (:meth:`Agent.error`). The programs of a round
-are written and run side by side, so that slots wait for a model together.
+(:meth:`Agent.step`) every slot that has a subtask left plans it on one frozen snapshot (``voxposer.runtime``), and one
+``env.step_waypoints`` executes all plans; with ``follow="waypoint"``, one ``env.step_ee_pose`` executes a waypoint of
+each. A slot that is stopped holds still, and the other slots continue; one whose questions the model does not answer
+ends at once, without a verdict (:meth:`Agent.error`).
 
 Nothing that a slot does depends on the others: in a round it executes its own plan and no tick more, so a slot may
 begin another episode (:meth:`Agent.begin`) while the others are anywhere in theirs.
@@ -14,92 +12,56 @@ begin another episode (:meth:`Agent.begin`) while the others are anywhere in the
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vecenv.contract import BatchEnv, Control, PlanControl
-from vecenv.errors import VecenvError
-from vecenv.manipulation.routes import RouteConfig, Stop
-from vecenv.manipulation.world import matrix
+from vecenv.contract import BatchEnv, Control
+from vecenv.errors import InvalidInput
 from vecenv.observations import ObjectsSnapshot
-from voxposer import pushing
-from voxposer.interface import Interface
+from voxposer.episode import (
+    ALL_SUBTASKS,
+    SUBTASK_BUDGET,
+    Expanded,
+    check_done,
+    expand_for_settle,
+    scattered,
+)
+from voxposer.following import FOLLOW, Following
 from voxposer.language.llm import Llm
-from voxposer.language.lmp import build_lmps
-from voxposer.language.lmp_config import CONFIGS, Call, LmpConfig
-from voxposer.language.replies import LlmError
-from voxposer.paths import plan_paths
-from voxposer.perception.config import HandState, PerceptionConfig
-from voxposer.perception.observation import PerceptionError
-from voxposer.perception.view import Perception
-from voxposer.planning import plan as plans
-from voxposer.planning.config import PlannerConfig
-from voxposer.planning.plan import PlanConfig, PlannedWaypoint, SubtaskPlan
-from voxposer.pushing import PushingConfig, PushSituation
-from voxposer.quaternions import quaternion
-from voxposer.requests import InterfaceError, MotionRequest
-from voxposer.sandbox.guard import HostFault, Limits
-from voxposer.slots import FOLLOWED, Grasp, Moving, Pushing, Ready, Slot, pending
-from voxposer.stops import stops_of, travel
-from voxposer.turns import Turns, TurnsOver
+from voxposer.planned import PlannedMotion
+from voxposer.runtime import RuntimeConfig, Runtimes
+from voxposer.slots import FOLLOWED, Slot
+
+__all__ = ["Agent", "AgentConfig", "PlannedMotion"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AgentConfig:
-    """Options of the agent.
+class AgentConfig(RuntimeConfig):
+    """Options of the agent: those of planning, here without budgets of subtasks and waypoints, and these.
 
     Attributes:
-        perception: how objects are seen.
-        route: distances that the hand keeps from the scene.
-        plan: how stops become waypoints.
-        planner: of paths over voxels.
-        push: how objects are pushed.
-        limits: what a program may use.
-        lmps: the language programs, by name.
-        repairs: how often the model is shown what a program of its did wrong, and asked for another; 0 for never.
         passes: how often the whole instruction is planned when it was executed to the end without success.
         max_misses: a plan is abandoned after this many waypoints in a row that could not be reached.
         idle_ticks: ticks that stopped slots wait in a round in which no slot has a plan.
+        wait: a slot that is stopped holds still until the environment's budget is spent, and may still be solved by
+            what moves on its own. False ends its episode at once.
+        follow: ``"plan"`` executes a whole plan in one call, ``"waypoint"`` one waypoint a call.
     """
 
-    perception: PerceptionConfig = field(default_factory=PerceptionConfig)
-    route: RouteConfig = field(default_factory=RouteConfig)
-    plan: PlanConfig = field(default_factory=PlanConfig)
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
-    push: PushingConfig = field(default_factory=PushingConfig)
-    limits: Limits = field(default_factory=Limits)
-    lmps: Mapping[str, LmpConfig] = field(default_factory=lambda: CONFIGS)
-    repairs: int = 1
+    max_subtasks: int | None = None
+    max_waypoints: int | None = None
     passes: int = 3
     max_misses: int = 2
     idle_ticks: int = 50
+    wait: bool = True
+    follow: Following = "plan"
 
-
-@dataclass(frozen=True)
-class PlannedMotion:
-    """One motion as it was planned, for display.
-
-    Attributes:
-        slot: index of the slot.
-        subtask: number of the subtask.
-        text: its words.
-        request: what the program asked for.
-        perception: the snapshot it was planned on.
-        path: over voxels, [P, 3].
-        stops: the stops of the hand along it.
-    """
-
-    slot: int
-    subtask: int
-    text: str
-    request: MotionRequest
-    perception: Perception
-    path: np.ndarray
-    stops: tuple[Stop, ...]
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.follow not in FOLLOW:
+            raise InvalidInput(f"follow={self.follow!r}: expected one of {', '.join(FOLLOW)}")
 
 
 class Agent:
@@ -130,17 +92,21 @@ class Agent:
         episodes: Sequence[str] = (),
     ) -> None:
         self.env, self.config, self._on_planned = env, config, on_planned
-        self._llm, self._prompts_dir = llm, prompts_dir
-        self._turns = Turns(1 if llm.config.is_rule_base else llm.config.concurrency)
-        self._finished, self.succeeded = np.zeros(env.num_envs, bool), np.zeros(env.num_envs, bool)
-        snapshots = env.observe_objects().snapshot
-        names = episodes or ("",) * env.num_envs
-        self.slots = [self._slot(*each) for each in zip(instructions, snapshots, names, strict=True)]
+        count = env.num_envs
+        planned = self._planned if on_planned else None
+        self._runtimes = Runtimes(llm, config, prompts_dir=prompts_dir, on_planned=planned, most=count)
+        self._finished, self.succeeded = np.zeros(count, bool), np.zeros(count, bool)
+        self._rounds, self._live = np.zeros(count, int), np.zeros(0, int)
+        self._subtasks: list[tuple[str, ...]] = [()] * count
+        self._index = np.zeros(count, int)
+        self._instructions = list(instructions)
+        self._handles = self._runtimes.init(env.observe_objects().snapshot, episodes)
+        self.slots = [self._opened(*pair) for pair in zip(self._handles, instructions, strict=True)]
 
     @property
     def rule_based(self) -> bool:
         """Whether rules write the programs, and no language model."""
-        return self._llm.config.is_rule_base
+        return self._runtimes.rule_based
 
     def begin(self, instructions: Sequence[str], slots: Sequence[int], episodes: Sequence[str] = ()) -> None:
         """Begin other episodes in some slots, which were just reset; the others continue theirs.
@@ -148,12 +114,14 @@ class Agent:
         Args:
             instructions: of every slot of the batch, B strings.
             slots: the slots that begin.
-            episodes: name of the episode in every slot of the batch, or none.
         """
         snapshots = self.env.observe_objects(slots=slots).snapshot
         for i in slots:
-            _release(self.slots[i])
-            self.slots[i] = self._slot(instructions[i], snapshots[i], episodes[i] if episodes else "")
+            self._runtimes.release([self._handles[i]])
+            (self._handles[i],) = self._runtimes.init([snapshots[i]], [episodes[i]] if episodes else ())
+            self.slots[i] = self._opened(self._handles[i], instructions[i])
+            self._instructions[i], self._subtasks[i] = instructions[i], ()
+            self._index[i] = self._rounds[i] = 0
             self._finished[i] = self.succeeded[i] = False
 
     def step(self) -> Control:
@@ -164,207 +132,107 @@ class Agent:
         """
         live = [i for i, slot in enumerate(self.slots) if not self._finished[i] and not slot.cause]
         snapshots = self.env.observe_objects(slots=live).snapshot
-        self._run_all_programs(live, snapshots)
-        waypoints = self._plan(live)
-        if not any(waypoints):
+        expanded = self._plan(live, snapshots)
+        ended = [i for i in live if self.slots[i].error or (self.slots[i].cause and not self.config.wait)]
+        if ended:
+            self.env.end_episodes(ended)
+        if not expanded.plan.valid.any():
             return self._record(self._wait())
-        waypoints = self._with_waiting(waypoints)
-        return self._record(self._execute(plans.stack(waypoints, self.config.plan)))
-
-    def close(self) -> None:
-        """Release snapshots and maps; nothing can be planned afterwards."""
-        for slot in self.slots:
-            _release(slot)
+        followed = FOLLOW[self.config.follow](self.env, self._with_waiting(expanded), self.config.max_misses)
+        for slot, missed in zip(self.slots, followed.missed.tolist(), strict=True):
+            slot.counts = replace(slot.counts, missed=slot.counts.missed + missed)
+        return self._record(followed.control)
 
     def error(self, index: int) -> str:
         """Why the episode in a slot ends without a verdict: the model could not be asked; "" if it could."""
         return self.slots[index].error
 
-    def _slot(self, instruction: str, snapshot: ObjectsSnapshot | None, episode: str = "") -> Slot:
-        """A slot whose episode has just begun."""
-        interface = Interface()
-        home = np.zeros(7) if snapshot is None else snapshot.ee_pose.copy()
-        lmps = build_lmps(
-            interface.functions(),
-            self._llm.for_episode(episode),
-            self._prompts_dir,
-            self.config.limits,
-            self.config.lmps,
-            repairs=self.config.repairs,
-            undo=interface.restart,
-            aside=self._turns.aside,
-        )
-        return Slot(instruction, lmps, interface, home)
+    def close(self) -> None:
+        """Release snapshots and maps; nothing can be planned afterwards."""
+        self._runtimes.release(self._handles)
+        self._handles = []
 
-    # -- one slot's subtask --------------------------------------------------------------------------------------------
+    def _opened(self, handle: str, instruction: str) -> Slot:
+        """The state of an episode that has just begun."""
+        slot = self._runtimes.slot(handle)
+        slot.instruction = instruction
+        return slot
 
-    def _run_all_programs(self, live: Sequence[int], snapshots: Sequence[ObjectsSnapshot | None]) -> None:
-        """Run the programs of every live slot; those whose questions were not answered end their episodes."""
-        asked = {i: len(self.slots[i].lmps.trace) for i in live}
-        self._turns.run([partial(self._run_programs, self.slots[i], snapshots[i]) for i in live])
-        if not self.rule_based:
-            _settle([call for i in live for call in self.slots[i].lmps.trace[asked[i] :]])
-        unanswered = [i for i in live if self.slots[i].error]
-        if unanswered:
-            self.env.end_episodes(unanswered)
-
-    def _run_programs(self, slot: Slot, snapshot: ObjectsSnapshot | None) -> None:
-        """Run the programs of the next subtasks until one asks for a motion."""
-        if snapshot is None:
-            slot.stop("no ground truth: the slot's physics failed")
-            return
-        try:
-            perception = self._look(slot, snapshot)
-            slot.interface.begin(perception)
-            if isinstance(slot.phase, Pushing) and pushing.arrived(slot.phase.task, perception):
-                slot.enter(pending(slot.phase.requests))
-            while isinstance(slot.phase, Ready) and self._has_subtask(slot, perception):
-                slot.progress = slot.progress.advanced()
-                slot.lmps.composer(slot.progress.text)
-                requests = tuple(slot.interface.taken())
-                if requests:
-                    slot.enter(Moving(requests))
-        except LlmError as error:
-            if error.permanent:
-                raise
-            slot.give_up(_described(error))
-        except TurnsOver:
-            raise
-        except (HostFault, PerceptionError, InterfaceError) as error:
-            _stop_with(slot, error)
-
-    def _look(self, slot: Slot, snapshot: ObjectsSnapshot) -> Perception:
-        """The slot's view of a snapshot, after checking whether the latest grasp holds."""
-        failed = slot.grip.failed
-        hand = HandState(snapshot.ee_pose, slot.home, slot.grip.closed)
-        perception = Perception(snapshot, hand, self.config.perception, failed)
-        grasp = slot.grip.grasp
-        empty = grasp is not None and slot.grip.closed and grasp.name in snapshot.movable
-        empty = empty and grasp is not None and perception.held != grasp.name
-        slot.grip = slot.grip.checked(held=not empty)
-        if empty:
-            slot.counts = replace(slot.counts, empty_grasps=slot.counts.empty_grasps + 1)
-            # An episode's first failed grasp is avoided from the next round on, later ones at once.
-            if failed:
-                perception.grasp_finder.failed = slot.grip.failed
-        return perception
-
-    def _has_subtask(self, slot: Slot, perception: Perception) -> bool:
-        """Whether a subtask is left; the instruction is planned when none is, as often as allowed."""
-        if slot.progress.has_next:
-            return True
-        if slot.progress.passes >= self.config.passes:
-            slot.stop(FOLLOWED)
-            return False
-        slot.progress = replace(slot.progress, passes=slot.progress.passes + 1)
-        slot.lmps.set_context(perception.names)
-        slot.progress = replace(slot.progress, subtasks=slot.lmps.plan(slot.instruction), cursor=0)
-        if not slot.progress.has_next:
-            slot.stop("the planner found nothing to do")
-        return slot.progress.has_next
+    def _planned(self, motion: PlannedMotion) -> None:
+        """Name the slot of a motion, which was planned as one row of a call."""
+        assert self._on_planned is not None
+        self._on_planned(replace(motion, slot=int(self._live[motion.slot])))
 
     # -- planning ------------------------------------------------------------------------------------------------------
 
-    def _plan(self, live: Sequence[int]) -> list[list[PlannedWaypoint]]:
-        """Waypoints of every slot for the motions that its programs asked for; an empty list where there are none."""
-        waypoints: list[list[PlannedWaypoint]] = [[] for _ in self.slots]
-        for i in live:
-            self._return_hand(self.slots[i])
-        while moving := [i for i in live if isinstance(self.slots[i].phase, Moving)]:
-            wants = [(self.slots[i].interface, self.slots[i].requests[0]) for i in moving]
-            paths = plan_paths(wants, self.config.planner, self.config.route)
-            for i, (_, request), path in zip(moving, wants, paths, strict=True):
-                waypoints[i] += self._plan_motion(i, request, path)
-        self._plan_pushes([i for i in live if isinstance(self.slots[i].phase, Pushing)], waypoints)
-        for slot, own in zip(self.slots, waypoints, strict=True):
-            slot.counts = replace(slot.counts, waypoints=slot.counts.waypoints + len(own))
-        return waypoints
+    def _plan(self, live: Sequence[int], snapshots: Sequence[ObjectsSnapshot | None]) -> Expanded:
+        """Waypoints of every slot; an instruction whose subtasks are used up is split again, as often as allowed."""
+        self._runtimes.observe([self._handles[i] for i in live], [snapshots[i] for i in live])
+        parts: list[tuple[np.ndarray, Expanded]] = []
+        while live := self._with_subtasks(live):
+            self._live = rows = np.array(live)
+            planned = self._runtimes.plan_subtask(
+                [self._handles[i] for i in live],
+                [self._subtasks[i] for i in live],
+                self._index[rows],
+                [snapshots[i] for i in live],
+            )
+            self._index[rows] = planned.next_subtask_index
+            expanded = expand_for_settle(
+                planned.trajectory, planned.prev_gripper, self.config.plan, max_waypoints=self.config.max_waypoints
+            )
+            self._runtimes.set_gripper([self._handles[i] for i in live], expanded.last_gripper)
+            parts.append((rows, expanded))
+            for i, count in zip(live, expanded.n_out.tolist(), strict=True):
+                slot = self.slots[i]
+                slot.counts = replace(slot.counts, waypoints=slot.counts.waypoints + count)
+            self._rounds[rows] += 1
+            live = rows[planned.n_waypoints == 0].tolist()
+        return scattered(parts, self.env.num_envs, self.config.plan)
 
-    def _return_hand(self, slot: Slot) -> None:
-        """Let planning start at the present pose of the hand, not at the end of what programs asked for."""
-        if slot.requests:
-            ee = slot.interface.perception.snapshot.ee_pose
-            slot.interface.perception.move_hand(ee[:3], matrix(ee[3:]), closed=slot.grip.closed)
+    def _with_subtasks(self, live: Sequence[int]) -> list[int]:
+        """The slots that have a subtask left; the others are split again or stopped, for the reason of the layer."""
+        rows = np.array(live, int)
+        counts = np.array([len(self._subtasks[i]) for i in live], int)
+        failed = [bool(self.slots[i].cause) for i in live]
+        most = self.config.max_subtasks
+        checked = check_done(
+            self._index[rows], counts, False, failed=failed, rounds=self._rounds[rows], max_subtasks=most
+        )
+        again = []
+        for i, reason in zip(live, checked.reason, strict=True):
+            if reason == ALL_SUBTASKS and self._may_split_again(i):
+                again.append(i)
+            elif reason == SUBTASK_BUDGET:
+                self.slots[i].stop(SUBTASK_BUDGET)
+        lists, _, _ = self._runtimes.planner([self._handles[i] for i in again], [self._instructions[i] for i in again])
+        for i, subtasks in zip(again, lists, strict=True):
+            self._subtasks[i], self._index[i] = subtasks, 0
+        return [i for i in live if not self.slots[i].cause]
 
-    def _plan_motion(
-        self, index: int, request: MotionRequest, path: np.ndarray | InterfaceError
-    ) -> list[PlannedWaypoint]:
-        """Waypoints of a slot's next motion; the hand is then taken to be at its end."""
-        slot = self.slots[index]
-        perception, rest = slot.interface.perception, slot.requests[1:]
-        try:
-            if isinstance(path, InterfaceError):
-                raise path
-            if request.object_centric:
-                slot.enter(Pushing(pushing.task_of(request.movable, perception.grid.world(path), perception), rest))
-                return []
-            stops = stops_of(request, path, perception, self.config.route, closed=slot.grip.closed)
-        except VecenvError as error:
-            _stop_with(slot, error)
-            return []
-        if request.kind == "path":
-            _remember_grasp(slot, request, path[-1])
-        if self._on_planned:
-            words = slot.progress.text
-            number, path = slot.progress.number, np.asarray(path)
-            self._on_planned(PlannedMotion(index, number, words, request, perception, path, tuple(stops)))
-        slot.enter(pending(rest))
-        waypoints = self._waypoints(slot, stops)
-        perception.move_hand(stops[-1].pos, matrix(stops[-1].quat), closed=slot.grip.closed)
-        return waypoints
+    def _may_split_again(self, i: int) -> bool:
+        """Whether a slot's instruction is split into subtasks once more; the slot is stopped if not."""
+        most = self.config.max_subtasks
+        if self.slots[i].progress.passes >= self.config.passes:
+            self.slots[i].stop(FOLLOWED)
+        elif most is not None and self._rounds[i] >= most:
+            self.slots[i].stop(SUBTASK_BUDGET)
+        return not self.slots[i].cause
 
-    def _waypoints(self, slot: Slot, stops: Sequence[Stop]) -> list[PlannedWaypoint]:
-        """Stops as waypoints; the grip after them is recorded."""
-        waypoints, closed = plans.expand_flips(stops, slot.grip.closed, slot.progress.number, self.config.plan)
-        slot.close_grip(closed)
-        return waypoints
+    # -- waiting -------------------------------------------------------------------------------------------------------
 
-    def _plan_pushes(self, pushing_slots: Sequence[int], waypoints: list[list[PlannedWaypoint]]) -> None:
-        """The next push of every slot that pushes, searched for all in one call."""
-        found = {i: situation for i in pushing_slots if (situation := self._situation(self.slots[i]))}
-        pushes = pushing.next_pushes(list(found.values()), self.config.push)
-        for i, stops in zip(found, pushes, strict=True):
-            slot = self.slots[i]
-            perception = slot.interface.perception
-            here = Stop(perception.ee.pos, quaternion(perception.ee.rotation), True)
-            way = [*travel([here, stops[0]], perception, self.config.route), *stops[1:]]
-            waypoints[i] += self._waypoints(slot, way)
-
-    def _situation(self, slot: Slot) -> PushSituation | None:
-        """What is known before the next push; None, and the slot stopped, where there is no room for one."""
-        assert isinstance(slot.phase, Pushing)
-        try:
-            return pushing.situation(slot.phase.task, slot.interface.perception, self.config.push)
-        except VecenvError as error:
-            _stop_with(slot, error)
-            return None
-
-    # -- execution -----------------------------------------------------------------------------------------------------
-
-    def _execute(self, plan: SubtaskPlan) -> PlanControl:
-        """Execute a plan to its end; a slot that cannot reach its waypoints resumes at its next change of grip."""
-        control = self.env.step_waypoints(plan, max_misses=self.config.max_misses)
-        while True:
-            missed = plan.valid & (control.waypoint_ticks > 0) & ~control.converged & (plan.hold == 0)
-            for slot, count in zip(self.slots, missed.sum(axis=1), strict=True):
-                slot.counts = replace(slot.counts, missed=slot.counts.missed + int(count))
-            plan = plans.remaining(plan, control.waypoint_ticks)
-            plan = plan._replace(valid=plan.valid & ~control.done[:, None])
-            if not plan.valid.any():
-                return control
-            control = self.env.step_waypoints(plan, max_misses=self.config.max_misses)
-
-    def _with_waiting(self, waypoints: Sequence[list[PlannedWaypoint]]) -> list[list[PlannedWaypoint]]:
-        """Waypoints with a hold for each slot that was stopped, grip unchanged, so that its budget runs out meanwhile.
+    def _with_waiting(self, expanded: Expanded) -> Expanded:
+        """With a hold for each slot that was stopped, grip unchanged, so that its budget runs out meanwhile.
 
         It is no longer than the longest of the plans, of which each waypoint takes a tick or more.
         """
-        ticks = max(sum(max(waypoint.hold, 1) for waypoint in own) for own in waypoints)
-        held = np.array([0.0, 0, 0, 1, 0, 0, 0])
-        return [
-            [PlannedWaypoint(held, slot.grip.closed, ticks, -1, 1.0)] if slot.cause and not finished else own
-            for slot, own, finished in zip(self.slots, waypoints, self._finished, strict=True)
-        ]
+        plan = expanded.plan
+        ticks = int(np.where(plan.valid, np.maximum(plan.hold, 1), 0).sum(axis=1).max())
+        for i, slot in enumerate(self.slots):
+            if slot.cause and not self._finished[i]:
+                plan.valid[i], plan.valid[i, 0] = False, True
+                plan.grip[i, 0], plan.hold[i, 0] = slot.grip.closed, ticks
+        return expanded
 
     def _wait(self) -> Control:
         """Hold still with the grip unchanged."""
@@ -375,44 +243,3 @@ class Agent:
     def _record(self, control: Control) -> Control:
         self._finished, self.succeeded = control.done, control.success
         return control
-
-
-def _release(slot: Slot) -> None:
-    """Release the snapshot and the maps of a slot."""
-    if isinstance(slot.phase, Moving | Pushing):
-        slot.enter(Ready())
-    slot.interface.end()
-
-
-def _stop_with(slot: Slot, error: Exception) -> None:
-    slot.stop(_described(error))
-
-
-def _described(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
-
-
-def _settle(calls: Sequence[Call]) -> None:
-    """Let the first of the equal questions of a round be the one that was paid, whichever happened to be asked first.
-
-    Args:
-        calls: the questions of all slots, slot by slot.
-    """
-    equal: dict[str, list[Call]] = {}
-    for call in calls:
-        if call.reply is not None:
-            equal.setdefault(json.dumps([*map(dict, call.messages)]), []).append(call)
-    for same in equal.values():
-        paid = sum(not call.cached for call in same)
-        for number, call in enumerate(same):
-            call.cached = number >= paid
-
-
-def _remember_grasp(slot: Slot, request: MotionRequest, end: np.ndarray) -> None:
-    """Keep what a path that ends at a voxel [3] closes the hand around, so that the next look can check it."""
-    perception = slot.interface.perception
-    voxel = np.clip(np.round(end), 0, perception.grid.size - 1).astype(int)
-    name = perception.targets.get((int(voxel[0]), int(voxel[1]), int(voxel[2])))
-    if name and request.closed_at_end(voxel) and name in perception.snapshot.poses:
-        offset = perception.position_of(voxel) - perception.snapshot.poses[name][:3]
-        slot.grip = replace(slot.grip, grasp=Grasp(name, offset))

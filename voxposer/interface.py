@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vecenv.manipulation.world import matrix
+from vecenv.observations import ObjectsSnapshot
 from voxposer.language.observations import Observation
 from voxposer.perception.observation import LazyObservation
 from voxposer.perception.view import HAND_ALIASES, Perception
@@ -68,6 +69,11 @@ class Interface:
         if self._perception is None:
             raise InterfaceError("no snapshot yet: call begin() first")
         return self._perception
+
+    @property
+    def snapshot(self) -> ObjectsSnapshot | None:
+        """The present snapshot; None without."""
+        return None if self._perception is None else self._perception.snapshot
 
     def functions(self) -> dict[str, Callable[..., Any]]:
         """Every function that programs may call, by name."""

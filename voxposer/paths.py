@@ -7,7 +7,7 @@ not given has no effect.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -24,9 +24,15 @@ CHUNK = 8
 
 
 def plan_paths(
-    wants: Sequence[tuple[Interface, MotionRequest]], config: PlannerConfig, route: RouteConfig
+    wants: Sequence[tuple[Interface, MotionRequest]],
+    config: PlannerConfig,
+    route: RouteConfig,
+    obstacles: dict[int, np.ndarray] | None = None,
 ) -> list[np.ndarray | InterfaceError]:
-    """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path."""
+    """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path.
+
+    The obstacle maps [N, N, N] that paths were planned on are put into ``obstacles``, if given, by index of request.
+    """
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
     jointed = [i for i, (interface, request) in enumerate(wants) if hangs_on_joint(interface.perception, request)]
     for i in jointed:
@@ -34,18 +40,23 @@ def plan_paths(
     asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None and i not in jointed]
     for first in range(0, len(asking), CHUNK):
         chunk = asking[first : first + CHUNK]
-        for i, path in zip(chunk, _planned([wants[i] for i in chunk], config, route), strict=True):
+        maps_of, refused = _obstacle_maps([wants[i] for i in chunk], route)
+        for i, path in zip(chunk, _planned([wants[i] for i in chunk], maps_of, refused, config), strict=True):
             paths[i] = path
+        if obstacles is not None:
+            obstacles |= dict(zip(chunk, maps_of, strict=True))
     return paths
 
 
 def _planned(
-    wants: Sequence[tuple[Interface, MotionRequest]], config: PlannerConfig, route: RouteConfig
+    wants: Sequence[tuple[Interface, MotionRequest]],
+    obstacles: Sequence[np.ndarray],
+    refused: Mapping[int, InterfaceError],
+    config: PlannerConfig,
 ) -> list[np.ndarray | InterfaceError]:
     padded = [*wants, *[wants[-1]] * ((1 if len(wants) == 1 else CHUNK) - len(wants))]
     starts = np.stack([start_of(interface, request) for interface, request in padded])
-    obstacles, refused = _obstacle_maps(wants, route)
-    obstacles += [obstacles[-1]] * (len(padded) - len(wants))
+    obstacles = [*obstacles, *[obstacles[-1]] * (len(padded) - len(wants))]
     found = optimize_paths(
         starts,
         np.stack([np.asarray(request.targets) for _, request in padded]),

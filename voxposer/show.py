@@ -1,39 +1,50 @@
 """Pages and images of ``vecenv voxposer show``: the maps, paths and programs of one task.
 
 A suite, a task and an episode come in; the task is planned and followed once, and an HTML page (plotly, one file, no
-network) and a PNG (matplotlib) go out. Each planned motion has a picture: the scene's surface, targets, what is kept
-away from, the planner's path, and the hand's way. Under it stands every program that the language model wrote, whether
-it came from the cache, and what it cost.
+network) and a PNG (matplotlib) go out. Each planned motion is drawn on the maps that it was planned on, beside what the
+camera saw, and is linked to the programs that the language model wrote for it, the settings and the commit.
 """
 
 from __future__ import annotations
 
-import html
-from collections.abc import Sequence
-from dataclasses import dataclass
+import base64
+import io
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from importlib.resources import files
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vecenv.errors import InvalidInput
+from vecenv.contract import BatchEnv
+from vecenv.errors import InvalidInput, MissingDependency, VecenvError
+from vecenv.util.revision import git_commit
 from voxposer.agent import Agent, AgentConfig, PlannedMotion
+from voxposer.figures import (
+    Figure,
+    color_of,
+    grip_figure,
+    layers,
+    map_views,
+    objects,
+    scene_figure,
+    slices_figure,
+)
 from voxposer.language.llm import Llm, LlmConfig
 from voxposer.language.lmp_config import Call
-from voxposer.paths import obstacle_map
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-# Voxels of an obstacle map above this are drawn, and no more than that many.
-_DRAWN_ABOVE = 0.3
-_DRAWN_AT_MOST = 3000
+TEMPLATE = "show.html.j2"
+_CAMERA = "agentview"
+# Packages whose versions the page names.
+_PACKAGES = ("vecenv", "mujoco", "jax", "numpy", "litellm")
+_KINDS = {"home": "back to where it began", "stay": "where it is", "path": "over maps"}
 # Of the picture around the hand's way, metres.
 _MARGIN = 0.15
-_STYLE = """body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem;color:#222}
-pre{background:#f5f5f5;padding:.7rem;overflow-x:auto;border-radius:4px}summary{cursor:pointer;padding:.2rem 0}
-.note{color:#666}.bad{color:#b00020}h2{margin-top:2.5rem}"""
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,12 @@ class EpisodeRecord:
         success: the task was solved.
         ticks: control ticks it took.
         cause: why the slot stopped, "" if it did not.
+        config: the agent's options.
+        images: what the camera saw when each motion was planned, uint8 [H, W, 3]; empty without images.
+        last_image: what it saw at the end.
+        no_images: why there are no images, "" if there are.
+        commit: of the code, "" outside a clone.
+        versions: of packages, by name.
     """
 
     title: str
@@ -61,6 +78,12 @@ class EpisodeRecord:
     success: bool
     ticks: int
     cause: str
+    config: AgentConfig = field(default_factory=AgentConfig)
+    images: tuple[np.ndarray, ...] = ()
+    last_image: np.ndarray | None = None
+    no_images: str = ""
+    commit: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
 
 
 def parse_task(text: str) -> tuple[str, int, int]:
@@ -83,19 +106,45 @@ def parse_task(text: str) -> tuple[str, int, int]:
     return suite, task, episode
 
 
+class _Recorder:
+    """Keeps motions as they are planned, and what the camera sees at that time."""
+
+    def __init__(self, env: BatchEnv) -> None:
+        self._env = env
+        self.motions: list[PlannedMotion] = []
+        self.images: list[np.ndarray] = []
+        self.no_images = ""
+
+    def __call__(self, motion: PlannedMotion) -> None:
+        self.motions.append(motion)
+        if (image := self.look()) is not None:
+            self.images.append(image)
+
+    def look(self) -> np.ndarray | None:
+        """What the camera sees now; None where images cannot be drawn."""
+        if self.no_images:
+            return None
+        try:
+            images = self._env.observe_egocentric().images
+            return np.array(images[_CAMERA if _CAMERA in images else next(iter(images))][0])
+        except (VecenvError, ImportError, StopIteration) as error:
+            self.no_images = str(error) or "the environment has no cameras"
+            return None
+
+
 def record_episode(
     suite: str, task: int, episode: int = 0, *, model: str = "offline/libero", prompts_dir: Path | None = None
 ) -> EpisodeRecord:
     """Plan and follow one episode of a task to its end, and keep what was planned."""
     import vecenv
+    from vecenv.doctor import installed_version
 
     env = vecenv.make(suite, task=task, episodes=[episode])
-    motions: list[PlannedMotion] = []
+    recorder, config = _Recorder(env), AgentConfig(passes=1)
     try:
         info = env.reset()
         prompts = str(prompts_dir) if prompts_dir else None
-        llm = Llm(LlmConfig(model=model))
-        agent = Agent(env, info.instruction, llm, AgentConfig(passes=1), prompts, motions.append)
+        agent = Agent(env, info.instruction, Llm(LlmConfig(model=model)), config, prompts, recorder)
         control = agent.step()
         while not control.done.all() and not agent.slots[0].cause:
             control = agent.step()
@@ -105,11 +154,17 @@ def record_episode(
             instruction=slot.instruction,
             model=model,
             subtasks=slot.progress.subtasks,
-            motions=tuple(motions),
+            motions=tuple(recorder.motions),
             calls=tuple(slot.lmps.trace),
             success=bool(control.success[0]),
             ticks=int(control.step_index[0]),
             cause=slot.cause,
+            config=config,
+            last_image=recorder.look(),
+            images=tuple(recorder.images),
+            no_images=recorder.no_images,
+            commit=git_commit(),
+            versions={name: version for name in _PACKAGES if (version := installed_version(name))},
         )
     finally:
         env.close()
@@ -119,23 +174,100 @@ def record_episode(
 
 
 def render_page(shown: EpisodeRecord) -> str:
-    """The HTML page, complete in itself."""
-    from plotly.offline import get_plotlyjs
+    """The HTML page, complete in itself.
 
-    verdict = "solved" if shown.success else "not solved"
-    subtasks = "".join(f"<li>{html.escape(text)}</li>" for text in shown.subtasks)
-    motions = "".join(_motion_section(number, motion) for number, motion in enumerate(shown.motions, start=1))
-    calls = "".join(_call_section(call) for call in shown.calls)
-    return f"""<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(shown.title)}</title>
-<style>{_STYLE}</style><script>{get_plotlyjs()}</script></head><body>
-<h1>{html.escape(shown.instruction)}</h1>
-<p>{html.escape(shown.title)}, programs by <b>{html.escape(_author(shown.model))}</b>: {verdict} in {shown.ticks} ticks.
-<span class="bad">{html.escape(shown.cause)}</span></p>
-<h2>Subtasks</h2><ol>{subtasks}</ol>
-<h2>Motions</h2><p class="note">Drag to turn, scroll to zoom, click names to hide them. Metres.</p>{motions}
-<h2>Programs</h2><p class="note">{_totals(shown.calls, shown.model)}</p>{calls}
-</body></html>
-"""
+    Raises:
+        MissingDependency: jinja2 or plotly is not installed.
+    """
+    try:
+        from jinja2 import Environment, StrictUndefined
+        from markupsafe import Markup
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise MissingDependency("the page needs jinja2 and plotly: pip install 'vecenv[voxposer]'") from error
+
+    figures: dict[str, Figure] = {}
+    names = sorted({name for motion in shown.motions for name in motion.perception.snapshot.objects})
+    motions = [_motion(number, motion, shown, names, figures) for number, motion in enumerate(shown.motions, start=1)]
+    motions_of: dict[int, list[int]] = defaultdict(list)
+    for number, motion in enumerate(shown.motions, start=1):
+        motions_of[motion.subtask].append(number)
+    made = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    # Scripts of the page's own; a language model writes none of them.
+    return made.from_string(files("voxposer").joinpath(TEMPLATE).read_text(encoding="utf-8")).render(
+        shown=shown,
+        author=_author(shown.model),
+        motions=motions,
+        motions_of=motions_of,
+        pictures={"ends": _ends(shown)},
+        totals=_totals(shown.calls, shown.model),
+        settings="\n".join(_settings(shown.config)),
+        figures=figures,
+        plotly_js=Markup(get_plotlyjs()),
+    )
+
+
+def _motion(
+    number: int, motion: PlannedMotion, shown: EpisodeRecord, names: Sequence[str], figures: dict[str, Figure]
+) -> dict[str, Any]:
+    """What the page says about a motion; its figures go into ``figures``."""
+    views = map_views(motion, shown.config.planner)
+    drawn = {"scene": scene_figure(motion, names), "maps": slices_figure(motion, views), "grip": grip_figure(motion)}
+    figures |= {f"{kind}-{number}": figure for kind, figure in drawn.items() if figure is not None}
+    pushed = "; the object is pushed along it, one push a snapshot" if motion.request.object_centric else ""
+    picture = shown.images[number - 1] if len(shown.images) == len(shown.motions) else None
+    return {
+        "number": number,
+        "text": motion.text,
+        "kind": _KINDS[motion.request.kind],
+        "movable": motion.request.movable,
+        "path": f"{len(motion.path)} waypoints of the planner, {len(motion.stops)} stops of the hand{pushed}",
+        "constants": [(view.name, view.constant) for view in views if view.values is None and view.constant],
+        "calls": _calls(motion, shown.calls),
+        "picture": "" if picture is None else _data_url(picture),
+        "has_slices": drawn["maps"] is not None,
+        "has_grip": drawn["grip"] is not None,
+    }
+
+
+def _calls(motion: PlannedMotion, calls: Sequence[Call]) -> dict[str, list[int]]:
+    """Numbers of the questions that a motion's subtask took, by language program, as the page counts them."""
+    found: dict[str, list[int]] = defaultdict(list)
+    for i in motion.calls:
+        if i < len(calls):
+            found[calls[i].lmp].append(i + 1)
+    return dict(found)
+
+
+def _ends(shown: EpisodeRecord) -> list[tuple[str, str]]:
+    """The first and the last image, with their words."""
+    first = [("at the start", _data_url(shown.images[0]))] if shown.images else []
+    return first + ([("at the end", _data_url(shown.last_image))] if shown.last_image is not None else [])
+
+
+def _data_url(image: np.ndarray) -> str:
+    """An image, uint8 [H, W, 3], as the address of a PNG."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def _settings(options: Any, prefix: str = "") -> list[str]:
+    """The fields of a config, and of those in it, as lines ``group.name: value``."""
+    lines: list[str] = []
+    named = (
+        options
+        if isinstance(options, Mapping)
+        else {each.name: getattr(options, each.name) for each in fields(options)}
+    )
+    for name, value in named.items():
+        if isinstance(value, Mapping) or is_dataclass(value):
+            lines += _settings(value, f"{prefix}{name}.")
+        else:
+            lines.append(f"{prefix}{name}: {value}")
+    return lines
 
 
 def _author(model: str) -> str:
@@ -151,81 +283,6 @@ def _totals(calls: Sequence[Call], model: str) -> str:
     known = [price for price in prices if price is not None]
     unknown = f", the price of {len(prices) - len(known)} unknown" if len(known) < len(prices) else ""
     return f"{asked}, {sum(known):.4f} US dollars{unknown}" if known else f"{asked}{unknown}"
-
-
-def _call_section(call: Call) -> str:
-    state = "from the cache" if call.cached else "asked"
-    state = f"repair, {state}" if call.repair else state
-    counted = call.prompt_tokens is not None and call.completion_tokens is not None
-    tokens = f", {call.prompt_tokens} + {call.completion_tokens} tokens" if counted else ""
-    error = f'<p class="bad">{html.escape(call.error)}</p>' if call.error else ""
-    context = f"{call.context}\n" if call.context else ""
-    return (
-        f"<details><summary><b>{html.escape(call.lmp)}</b>: {html.escape(call.query)} "
-        f'<span class="note">{state}{tokens}</span></summary>{error}'
-        f"<pre>{html.escape(context)}{html.escape(call.code)}</pre></details>"
-    )
-
-
-def _motion_section(number: int, motion: PlannedMotion) -> str:
-    kinds = {"home": "back to where it began", "stay": "where it is", "path": "over maps"}
-    words = f"{number}. {motion.text} ({kinds[motion.request.kind]})"
-    picture = figure(motion).to_html(full_html=False, include_plotlyjs=False, default_height="520px")
-    return f"<h3>{html.escape(words)}</h3>{picture}"
-
-
-def figure(motion: PlannedMotion) -> Any:
-    """One motion as a plotly figure."""
-    import plotly.graph_objects as go
-
-    marks = {"surface": (2, "#9aa0a6", 0.5), "keep away": (3, "#d93025", 0.15), "targets": (7, "#188038", 0.9)}
-    traces = [
-        _cloud(go, name, points, *marks[name])
-        for name, points in layers(motion).items()
-        if name in marks and len(points)
-    ]
-    lines = {"planner's path": ("#1a73e8", "lines"), "hand's way": ("#f29900", "lines+markers")}
-    found = layers(motion)
-    for name, (colour, mode) in lines.items():
-        points = found[name]
-        if len(points):
-            x, y, z = points.T
-            line = {"color": colour, "width": 5}
-            traces.append(go.Scatter3d(x=x, y=y, z=z, mode=mode, name=name, line=line, marker={"size": 3}))
-    result = go.Figure(traces)
-    result.update_layout(scene={"aspectmode": "data"}, margin={"l": 0, "r": 0, "t": 0, "b": 0})
-    return result
-
-
-def _cloud(go: ModuleType, name: str, points: np.ndarray, size: int, colour: str, opacity: float) -> Any:
-    x, y, z = points.T
-    marker = {"size": size, "color": colour, "opacity": opacity}
-    return go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker)
-
-
-def layers(motion: PlannedMotion) -> dict[str, np.ndarray]:
-    """What there is to see of a motion: name -> points [n, 3], metres, world frame; none where there is nothing."""
-    perception, request = motion.perception, motion.request
-    grid = perception.grid
-    parts = [part.cloud.points for part in perception.snapshot.parts.values()]
-    points = np.concatenate([perception.snapshot.scene.points, *parts])
-    inside = ((points >= grid.lo) & (points <= grid.hi)).all(axis=1)
-    none = np.zeros((0, 3))
-    targets = none if request.targets is None else grid.world(np.argwhere(request.targets))
-    return {
-        "surface": points[inside],
-        "keep away": none if request.targets is None else _kept_away(motion),
-        "targets": targets,
-        "planner's path": grid.world(motion.path) if len(motion.path) else none,
-        "hand's way": np.array([stop.pos for stop in motion.stops]).reshape(-1, 3),
-    }
-
-
-def _kept_away(motion: PlannedMotion) -> np.ndarray:
-    """Middles of the voxels that the planner kept away from."""
-    cost = obstacle_map(motion.perception, motion.request, AgentConfig().route)
-    voxels = np.argwhere(cost > _DRAWN_ABOVE)
-    return motion.perception.grid.world(voxels[:: max(1, len(voxels) // _DRAWN_AT_MOST)])
 
 
 # -- the picture -------------------------------------------------------------------------------------------------------
@@ -247,13 +304,13 @@ def save_image(shown: EpisodeRecord, path: Path) -> None:
 
 
 def _draw(axes: Axes3D, motion: PlannedMotion) -> None:
-    found = layers(motion)
+    found, things = layers(motion), objects(motion)
     axes.set_title(motion.text, fontsize=8)
-    way = np.concatenate([found["targets"], found["hand's way"]])
+    way = np.concatenate([found["targets"], found["hand's way"], found["planner's path"]])
     low, high = way.min(axis=0) - _MARGIN, way.max(axis=0) + _MARGIN
-    surface = found["surface"]
-    surface = surface[((surface >= low) & (surface <= high)).all(axis=1)]
-    axes.scatter(*surface.T, s=3, c=surface[:, 2], cmap="Greys_r", alpha=0.7)
+    for name, points in {"": found["surroundings"], **things}.items():
+        near = points[((points >= low) & (points <= high)).all(axis=1)]
+        axes.scatter(*near.T, s=3, c=color_of(name, [*things]) if name else "#9aa0a6", alpha=0.6)
     axes.scatter(*found["targets"].T, s=30, c="#188038")
     axes.plot(*found["planner's path"].T, c="#1a73e8", lw=2)
     axes.plot(*found["hand's way"].T, c="#f29900", lw=2, marker="o", ms=3)

@@ -12,12 +12,12 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from vecenv.actions import GRIPPER
+from vecenv.actions import GRIPPER, ee_pose_fields
 from vecenv.contract import BatchEnv, Control, EePoseControl, Metrics, PlanControl, ResetInfo, State, Timings, Watcher
 from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
@@ -203,15 +203,19 @@ class HandView:
         self.close()
 
     def step_ee_pose(
-        self, poses: npt.ArrayLike | Mapping[str, object] | None, hold_steps: npt.ArrayLike = 0
+        self,
+        poses: npt.ArrayLike | Mapping[str, object] | None,
+        hold_steps: npt.ArrayLike = 0,
+        *,
+        carry: npt.ArrayLike = False,
+        slots: npt.ArrayLike | None = None,
     ) -> EePoseControl:
         """Drive the hand to poses, [B, 8]; the final pose returned is the hand's."""
-        if poses is None or isinstance(poses, Mapping):
-            raise TypeError("poses of the hand are an array [B, 8]")
-        converted = np.array(poses, float)
+        given: dict[str, Any] = {"hold_steps": hold_steps, "carry": carry, "slots": slots, **ee_pose_fields(poses)}
+        converted = np.array(() if given.get("pose") is None else given["pose"], float)
         if converted.size:
             converted[..., :7] = tool_poses(converted[..., :7])
-        control = self.env.step_ee_pose(converted, hold_steps)
+        control = self.env.step_ee_pose({**given, "pose": converted})
         return replace(control, final_pose=hand_poses(control.final_pose))
 
     def step_waypoints(self, plan: object, max_misses: int | None = None) -> PlanControl:

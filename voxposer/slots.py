@@ -1,8 +1,8 @@
-"""The state of one slot of the agent, as frozen values and a table of the transitions between its phases.
+"""The state of one slot, as frozen values and a table of the transitions between its phases.
 
 In: events of a round (a program asked for motions, a path was planned, an object arrived, an error). Out: a
 :class:`Slot` whose phase, progress, grip and counts are each replaced by a new frozen value. Nothing here looks at the
-scene or plans; ``voxposer.agent`` decides which event happened.
+scene or plans; ``voxposer.runtime`` decides which event happened.
 
 A slot is *ready* until the program of its next subtask asks for motions, then *moving* while some of them are not yet
 planned. A motion of an object makes it *pushing*, one push a round, until the object has arrived; the other motions of
@@ -17,6 +17,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from vecenv.observations import ObjectsSnapshot
 from voxposer.interface import Interface
 from voxposer.language.lmp import Lmps
 from voxposer.pushing import PushTask
@@ -33,9 +34,13 @@ class Ready:
 
 @dataclass(frozen=True)
 class Moving:
-    """A program has asked for motions that are not planned yet: ``requests``, at least one, in order."""
+    """A program has asked for motions that are not planned yet: ``requests``, at least one, in order.
+
+    The first of them was planned ``iterations`` times; it is planned again until the hand has reached its targets.
+    """
 
     requests: tuple[MotionRequest, ...]
+    iterations: int = 0
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,7 @@ TRANSITIONS: Mapping[type, tuple[type, ...]] = MappingProxyType(
     {
         # A program asked for motions; or an error, no snapshot, no subtask left.
         Ready: (Moving, Stopped, Unanswered),
-        # A motion was planned, others wait or none is left; an object is to be pushed; there is no path.
+        # A motion was planned, others wait or none is left; an object is to be pushed; there is no path; abandoned.
         Moving: (Moving, Ready, Pushing, Stopped),
         # The object has arrived, other motions wait or none is left; or there is no room to push it.
         Pushing: (Moving, Ready, Stopped),
@@ -90,6 +95,7 @@ class Progress:
         passes: how often the instruction was planned.
         begun: subtasks begun in all passes.
         text: the latest subtask.
+        unfinished: index of a subtask of which something is left to plan, None for none.
     """
 
     subtasks: tuple[str, ...] = ()
@@ -97,6 +103,7 @@ class Progress:
     passes: int = 0
     begun: int = 0
     text: str = ""
+    unfinished: int | None = None
 
     @property
     def has_next(self) -> bool:
@@ -111,6 +118,11 @@ class Progress:
     def advanced(self) -> Progress:
         """With the next subtask begun."""
         return replace(self, text=self.subtasks[self.cursor], cursor=self.cursor + 1, begun=self.begun + 1)
+
+    def at(self, subtasks: tuple[str, ...], index: int) -> Progress:
+        """With ``index`` as the next subtask; past it, where it is the unfinished one."""
+        cursor = self.cursor if index == self.unfinished else index
+        return replace(self, subtasks=subtasks, cursor=cursor, unfinished=None)
 
 
 @dataclass(frozen=True)
@@ -152,6 +164,21 @@ class Counts:
     empty_grasps: int = 0
 
 
+@dataclass(frozen=True)
+class Latest:
+    """The subtask that was planned last.
+
+    Attributes:
+        movable: what its last motion moves.
+        object_centric: whether that is an object, to be pushed.
+        calls: its questions to the model, as a range of the trace.
+    """
+
+    movable: str = ""
+    object_centric: bool = False
+    calls: range = range(0)
+
+
 @dataclass(eq=False)
 class Slot:
     """One slot: its language programs, and its present state.
@@ -165,6 +192,8 @@ class Slot:
         progress: how far it is with its instruction.
         grip: what it knows about its grip.
         counts: what the episode took so far.
+        latest: the subtask that was planned last.
+        snapshot: the latest one, None where there is none.
     """
 
     instruction: str
@@ -175,6 +204,8 @@ class Slot:
     progress: Progress = field(default_factory=Progress)
     grip: Grip = field(default_factory=Grip)
     counts: Counts = field(default_factory=Counts)
+    latest: Latest = field(default_factory=Latest)
+    snapshot: ObjectsSnapshot | None = None
 
     @property
     def cause(self) -> str:
@@ -203,6 +234,12 @@ class Slot:
     def give_up(self, cause: str) -> None:
         """End without a verdict: the language model could not be asked."""
         self.enter(Unanswered(cause))
+
+    def resume(self, subtasks: tuple[str, ...], index: int) -> None:
+        """Go on with a subtask: the one under way if ``index`` is its, else that one is abandoned."""
+        if index != self.progress.unfinished and not isinstance(self.phase, Ready):
+            self.enter(Ready())
+        self.progress = self.progress.at(subtasks, index)
 
     def close_grip(self, closed: bool) -> None:
         """Record the last grip command of a plan."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.libero_batch import make
 
+from vecenv.actions import ActionError
 from vecenv.libero.env import LiberoEnv
 
 
@@ -17,6 +18,26 @@ def env() -> Iterator[LiberoEnv]:
     env.reset()
     yield env
     env.close()
+
+
+def _descent(start: np.ndarray) -> dict[str, np.ndarray]:
+    """Three waypoints on the way down and to one side, the grip closing between the last two."""
+    poses = np.repeat(start[:, None], 4, axis=1)
+    poses[:, :, 0] += [0.03, 0.06, 0.06, 0.06]
+    poses[:, :, 2] -= np.array([[0.01], [0.03], [0.05]]) * [1, 2, 2, 1]
+    shape = poses.shape[:2]
+    return {
+        "poses": poses,
+        "grip": np.tile([0, 0, 1, 1], (3, 1)),
+        "hold": np.tile([0, 0, 5, 0], (3, 1)),
+        "valid": np.ones(shape, bool),
+    }
+
+
+def _one(env: LiberoEnv, plan: dict[str, np.ndarray], t: int, carry: bool) -> np.ndarray:
+    """Waypoint ``t`` of a plan in a call of its own; the ticks that it took, int [B]."""
+    pose = np.concatenate([plan["poses"][:, t], plan["grip"][:, t, None]], axis=1)
+    return env.step_ee_pose(pose, plan["hold"][:, t], carry=carry).step_count
 
 
 class TestEePose:
@@ -70,6 +91,55 @@ class TestEePose:
         assert control.error == ("quaternion has no length", "pose is not finite", "")
         assert control.converged.tolist() == [False, False, True]
         assert control.step_count[0] == control.step_count[1] == 0
+
+    def test_an_unknown_key_is_refused(self, env: LiberoEnv) -> None:
+        with pytest.raises(ActionError, match="unknown key 'holds'; expected pose, hold_steps, carry, slots"):
+            env.step_ee_pose({"pose": [], "holds": 2})
+
+    @pytest.mark.parametrize("carry", ["yes", [True, False], 1])
+    def test_carry_is_true_or_false_of_each_slot(self, env: LiberoEnv, carry: object) -> None:
+        with pytest.raises(ActionError, match=r"^carry: .*true or false, or 3 of them"):
+            env.step_ee_pose([], carry=carry)  # pyright: ignore[reportArgumentType]
+
+    def test_slots_that_are_not_named_stand_still(self, env: LiberoEnv) -> None:
+        start = env.step_ee_pose([]).final_pose
+        target = np.concatenate([start, np.zeros((3, 1))], axis=1)
+        target[:, 2] -= 0.03
+        control = env.step_ee_pose({"pose": target, "slots": [1]})
+        assert control.step_count[1] > 1
+        assert control.step_count[[0, 2]].tolist() == [0, 0]
+        assert control.error == ("", "", "")
+
+    def test_waypoints_one_call_each_are_followed_as_in_one_plan_if_the_servo_carries_on(self) -> None:
+        """The plan in one call, then the same waypoints one call each, with and without ``carry``."""
+        ended, ticks = [], []
+        for carry in (None, True, False):
+            env = make()
+            env.reset()
+            plan = _descent(env.step_ee_pose([]).final_pose)
+            if carry is None:
+                spent = env.step_waypoints(plan).waypoint_ticks
+            else:
+                spent = np.stack([_one(env, plan, t, carry and t > 0) for t in range(4)], axis=1)
+            ticks.append(spent)
+            ended.append(env.state().qpos)
+            env.close()
+        np.testing.assert_array_equal(ticks[1], ticks[0])
+        np.testing.assert_array_equal(ended[1], ended[0])
+        assert (ticks[2].sum(axis=1) > ticks[0].sum(axis=1)).all()
+
+    def test_there_is_nothing_to_carry_on_after_another_kind_of_step(self) -> None:
+        ended = []
+        for carry in (True, False):
+            env = make()
+            env.reset()
+            plan = _descent(env.step_ee_pose([]).final_pose)
+            _one(env, plan, 0, carry=False)
+            env.step_continuous(np.zeros((3, 7)))
+            _one(env, plan, 1, carry=carry)
+            ended.append(env.state().qpos)
+            env.close()
+        np.testing.assert_array_equal(*ended)
 
     def test_a_grasp_lifts_a_real_object(self) -> None:
         env = make(episodes=[0], settle_steps=10)

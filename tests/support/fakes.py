@@ -118,7 +118,7 @@ class FakeEnv:
             cumulative_reward=self.terminated.astype(float),
         )
 
-    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> EePoseControl:
+    def step_ee_pose(self, poses: Any, hold_steps: Any = 0, *, carry: Any = False, slots: Any = None) -> EePoseControl:
         control = self.step_continuous(np.zeros((self.num_envs, 7)))
         return EePoseControl(**vars(control), error=("",) * self.num_envs)
 

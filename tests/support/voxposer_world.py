@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vecenv.contract import Control, Metrics, PlanControl, ResetInfo
+from vecenv.contract import Control, EePoseControl, Metrics, PlanControl, ResetInfo
 from vecenv.observations import Egocentric, Objects, ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 
 HOME = np.array([0.0, 0.0, 0.4, 0.0, 1.0, 0.0, 0.0])
@@ -64,6 +64,7 @@ class Obedient:
 
     Attributes:
         plans: every plan it was given.
+        waypoints: every action of ``step_ee_pose`` it was given.
         ticks: control ticks of each slot.
     """
 
@@ -71,6 +72,7 @@ class Obedient:
         self.snapshots, self.num_envs = list(snapshots), len(snapshots)
         self.ticks = np.zeros(self.num_envs, int)
         self.plans: list[Any] = []
+        self.waypoints: list[Any] = []
         self.ended = np.zeros(self.num_envs, bool)
         self._budget, self._solved_after = budget, solved_after
 
@@ -108,17 +110,27 @@ class Obedient:
         return {
             "reward": solved.astype(float),
             "terminated": solved,
-            "truncated": ~solved & (self.ended | (self.ticks >= self._budget)),
+            "truncated": ~solved & ((self.ticks >= self._budget) | self.ended),
             "success": solved,
             "step_index": self.ticks.copy(),
             "info": {"sanitized": solved, "fault": ("",) * self.num_envs, "ticks": self.ticks.copy()},
         }
 
+    def step_ee_pose(self, poses: Any) -> EePoseControl:
+        """One waypoint of each of the named slots, given as a mapping."""
+        before = self.ticks.copy()
+        for slot in np.flatnonzero(poses["slots"] & ~self._flags()["truncated"]):
+            gap = 0.0 if poses["pose"][slot, 7] else 0.04
+            hold = poses["hold_steps"][slot]
+            here = self.snapshots[slot].ee_pose if hold else poses["pose"][slot, :7].copy()
+            self.snapshots[slot] = replace(self.snapshots[slot], ee_pose=here, gripper=np.array([gap, -gap]))
+            self.ticks[slot] += max(hold, 1)
+        self.waypoints.append(poses)
+        spent = self.ticks - before
+        return EePoseControl(**self._flags(), converged=spent > 0, step_count=spent, error=("",) * self.num_envs)
+
     def end_episodes(self, slots: Any) -> None:
         self.ended[slots] = True
-
-    def step_ee_pose(self, poses: Any, hold_steps: Any = 0) -> Any:
-        raise NotImplementedError
 
     def evaluate(self) -> Metrics:
         flags = self._flags()

@@ -18,7 +18,7 @@ import vecenv
 from vecenv.contract import BatchEnv
 from vecenv.manipulation.routes import RouteConfig
 from vecenv.observations import ObjectsSnapshot
-from voxposer.agent import Agent, AgentConfig
+from voxposer.agent import Agent, AgentConfig, PlannedMotion
 from voxposer.interface import Interface
 from voxposer.language.llm import Llm, LlmConfig
 from voxposer.language.replies import LlmError, Reply
@@ -249,9 +249,12 @@ REPLIES = {
 }
 
 
-def agent(env: Obedient, words: tuple[str, ...], **options: Any) -> tuple[Agent, Scripted]:
+def agent(
+    env: Obedient, words: tuple[str, ...], on_planned: Callable[[PlannedMotion], None] | None = None, **options: Any
+) -> tuple[Agent, Scripted]:
     llm = Scripted(dict(sorted(REPLIES.items(), key=lambda item: -len(item[0]))))
-    return Agent(cast(BatchEnv, env), words, llm, AgentConfig(passes=1, **options)), llm
+    config = AgentConfig(**{"passes": 1, **options})
+    return Agent(cast(BatchEnv, env), words, llm, config, on_planned=on_planned), llm
 
 
 def test_each_subtask_is_planned_on_the_present_state() -> None:

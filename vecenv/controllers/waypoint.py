@@ -221,12 +221,19 @@ class Progress(NamedTuple):
     ticks: Int[Array, "B T"]
 
 
-def begin_plan(plan: WaypointPlan, current: Pose) -> Progress:
-    """Progress before the first tick, from the end effector's pose now."""
+def begin_plan(plan: WaypointPlan, reference: Pose) -> Progress:
+    """Progress before the first tick; the servo's reference starts at the end effector unless it is carried on."""
     shape = plan.valid.shape
     none = jnp.zeros(shape[0], jnp.int32)
     index = _next_valid(plan.valid, none)
-    return Progress(index, none, none, current, jnp.zeros(shape, bool), jnp.zeros(shape, jnp.int32))
+    return Progress(index, none, none, reference, jnp.zeros(shape, bool), jnp.zeros(shape, jnp.int32))
+
+
+def start_reference(current: Pose, carried: Real[AnyArray, "B 7"]) -> Pose:
+    """Where the servo's reference starts: at the end effectors, or at the rows of ``carried`` that are not NaN."""
+    kept = jnp.isfinite(carried).all(-1, keepdims=True)
+    pos, quat = jnp.asarray(current.pos), jnp.asarray(current.quat)
+    return Pose(jnp.where(kept, carried[..., :3], pos), jnp.where(kept, carried[..., 3:], quat))
 
 
 def unfinished(plan: WaypointPlan, progress: Progress) -> Bool[Array, " B"]:
@@ -235,14 +242,20 @@ def unfinished(plan: WaypointPlan, progress: Progress) -> Bool[Array, " B"]:
 
 
 def plan_action(
-    plan: WaypointPlan, progress: Progress, current: Pose, config: WaypointConfig = STEP_EE_POSE
+    plan: WaypointPlan,
+    progress: Progress,
+    current: Pose,
+    moves: Bool[AnyArray, " B"],
+    config: WaypointConfig = STEP_EE_POSE,
 ) -> tuple[Float[Array, "B 7"], Progress]:
-    """Action of one tick, [B, 7], and the progress with the servo's new reference."""
+    """Action of one tick, [B, 7], and the progress with the servo's new reference in the slots ``moves``, bool [B]."""
     target, grip, hold = _at_index(plan, progress.index)
     moving, ahead = servo(current, target, grip, progress.reference, config)
     holding = (hold > 0)[:, None]
     action = jnp.where(holding, hold_action(grip), moving)
     reference = Pose(*(jnp.where(holding, now, new) for now, new in zip(current, ahead, strict=True)))
+    parts = zip(reference, progress.reference, strict=True)
+    reference = Pose(*(jnp.where(jnp.asarray(moves)[:, None], new, old) for new, old in parts))
     return action, progress._replace(reference=reference)
 
 

@@ -100,6 +100,8 @@ class LiberoEnv(SlotBatch):
         self._tasks = {
             i: _TaskData(self._sources[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
         }
+        # Where the servo's references ended; NaN where there is none to carry on from.
+        self._references = np.full((self.num_envs, 7), np.nan)
         scene_of_slot = np.array([self._tasks[int(task)].scene for task in self._placement.task])
         self._scene_of_slot = scene_of_slot
         if self._physics is None or not self._physics.serves(scenes, scene_of_slot):
@@ -166,6 +168,7 @@ class LiberoEnv(SlotBatch):
         return str(task)
 
     def _arm(self, stale: np.ndarray) -> None:
+        self._references[stale] = np.nan
         for group in self.physics.groups:
             for task in np.unique(self._placement.task[group.slots]):
                 slots = group.slots[(self._placement.task[group.slots] == task) & stale[group.slots]]
@@ -214,6 +217,7 @@ class LiberoEnv(SlotBatch):
         until = self._until_success
         with self._stepping():
             ran = self.physics.run(chunk, ~self.done, self._ticks_left, self._watchers, until_success=until)
+        self._references[ran.ticks > 0] = np.nan
         return self._control(Control, self._book(ran.ticks, ran.success, ran.solved), before, sanitized)
 
     def _images_s(self) -> float:
@@ -226,14 +230,16 @@ class LiberoEnv(SlotBatch):
     def _failures(self) -> Mapping[int, str]:
         return self.physics.faults
 
-    def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _drive(
+        self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray, carry: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         poses = waypoint.Pose(targets[:, None, :3], targets[:, None, 3:7])
         plan = waypoint.WaypointPlan(poses, targets[:, 7:], hold[:, None], moves[:, None])
-        reward, arrived, _ = self._follow(plan)
+        reward, arrived, _ = self._follow(plan, carry=carry)
         return reward, arrived[:, 0]
 
     def _follow(
-        self, plan: waypoint.WaypointPlan, max_misses: int | None = None
+        self, plan: waypoint.WaypointPlan, max_misses: int | None = None, carry: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         followed = self.physics.follow(
             plan,
@@ -243,7 +249,10 @@ class LiberoEnv(SlotBatch):
             max_misses=max_misses,
             watchers=self._watchers,
             until_success=self._until_success,
+            reference=None if carry is None else np.where(carry[:, None], self._references, np.nan),
         )
+        moved = followed.ticks > 0
+        self._references[moved] = followed.reference[moved]
         reward = self._book(followed.ticks, followed.success, followed.solved)
         return reward, followed.converged, followed.waypoint_ticks
 
@@ -411,6 +420,7 @@ class LiberoEnv(SlotBatch):
             model, slots = group.scene.model, group.slots
             qpos, qvel = chosen.qpos[slots, : model.nq], chosen.qvel[slots, : model.nv]
             self.physics.write_state(group, qpos, qvel, chosen.time[slots])
+        self._references[:] = np.nan
         self._quarantine(np.ones(self.num_envs, bool))
 
 

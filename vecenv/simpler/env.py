@@ -236,7 +236,10 @@ class SimplerEnv(SlotBatch):
     def _tools(self) -> np.ndarray:
         return self._facts["tcp"].copy()
 
-    def _drive(self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _drive(
+        self, targets: np.ndarray, hold: np.ndarray, moves: np.ndarray, carry: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        del carry  # the servo always goes on from the reference of the last call
         servo, driving, reward = self._servo, hold == 0, np.zeros(self.num_envs)
         servo.begin(self._facts["tcp"])
         ticks = np.where(driving, servo.config.max_steps, hold)

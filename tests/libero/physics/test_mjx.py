@@ -132,6 +132,24 @@ def test_a_plan_is_followed_as_on_native_physics(both: tuple[LiberoEnv, LiberoEn
     assert ours.step_index[2] == theirs.step_index[2]
 
 
+def test_a_motion_is_carried_on_in_the_next_call(warp: LiberoEnv) -> None:
+    ticks = []
+    for carry in (None, True, False):
+        warp.set_episodes(tasks=0, episodes=range(SLOTS))
+        warp.reset()
+        poses = np.repeat(np.stack([s.ee_pose for s in snapshots(warp)])[:, None], 2, axis=1)
+        poses[:, :, 0] += [0.04, 0.08]
+        flat = {"grip": np.zeros((SLOTS, 2)), "hold": np.zeros((SLOTS, 2), int), "valid": np.ones((SLOTS, 2), bool)}
+        if carry is None:
+            ticks.append(warp.step_waypoints({"poses": poses, **flat}).waypoint_ticks.sum(axis=1))
+            continue
+        targets = np.concatenate([poses, np.zeros((SLOTS, 2, 1))], axis=2)
+        spent = [warp.step_ee_pose(targets[:, t], carry=carry and t > 0).step_count for t in range(2)]
+        ticks.append(np.sum(spent, axis=0))
+    assert np.abs(ticks[1] - ticks[0]).max() <= 1
+    assert (ticks[2] > ticks[0] + 1).all()
+
+
 def test_watchers_hear_of_every_tick_of_a_compiled_call(warp: LiberoEnv) -> None:
     warp.set_episodes(tasks=0, episodes=range(SLOTS))
     warp.reset()

@@ -185,10 +185,12 @@ class FollowResult(RunResult):
     Attributes:
         converged: within tolerance when the waypoint was left, bool [B, T].
         waypoint_ticks: control steps spent on each waypoint, int [B, T].
+        reference: where the servo's references ended, xyz + wxyz, [B, 7].
     """
 
     converged: np.ndarray
     waypoint_ticks: np.ndarray
+    reference: np.ndarray
 
 
 class Physics(ABC, Generic[G]):
@@ -315,6 +317,7 @@ class Physics(ABC, Generic[G]):
         max_misses: int | None = None,
         watchers: Sequence[Watcher] = (),
         until_success: bool = True,
+        reference: np.ndarray | None = None,
     ) -> FollowResult:
         """Follow plans; a slot stops at the end of its plan and at its own success, fault or limit.
 
@@ -325,17 +328,20 @@ class Physics(ABC, Generic[G]):
             config: tolerances and speeds.
             max_misses: stop a slot after this many waypoints in a row that ran out of ticks; None for no limit.
             watchers, until_success: as for ``run``.
+            reference: where the servo's references start, [B, 7]; at the end effectors in rows of NaN, and without it.
         """
         follower = _follower(config)
         loop = _HostLoop(self, active, limit, watchers, until_success)
-        progress = follower.begin(plan, self.eef())
+        carried = np.full((self.num_envs, 7), np.nan) if reference is None else reference
+        progress = follower.begin(plan, self.eef(), carried)
         while True:
             going = np.asarray(progress.index) < plan.valid.shape[1]
             if max_misses is not None:
                 going &= np.asarray(progress.misses) < max_misses
-            if not (going & loop.going).any():
+            going &= loop.going
+            if not going.any():
                 break
-            actions, progress = follower.action(plan, progress, self.eef())
+            actions, progress = follower.action(plan, progress, self.eef(), going)
             moved = loop.tick(np.asarray(actions), going)
             progress = follower.advance(plan, progress, self.eef(), moved)
         return FollowResult(
@@ -344,6 +350,7 @@ class Physics(ABC, Generic[G]):
             solved=loop.solved,
             converged=np.asarray(progress.converged),
             waypoint_ticks=np.asarray(progress.ticks),
+            reference=np.concatenate([np.asarray(part) for part in progress.reference], axis=1),
         )
 
 
@@ -395,9 +402,13 @@ class _Follower(NamedTuple):
 
 @functools.lru_cache(maxsize=8)
 def _follower(config: waypoint.WaypointConfig) -> _Follower:
-    functions = (waypoint.begin_plan, waypoint.plan_action, waypoint.plan_advance)
+    functions = (_begin, waypoint.plan_action, waypoint.plan_advance)
     options = ({}, {"config": config}, {"config": config})
     return _Follower(*(_on_cpu(functools.partial(f, **o)) for f, o in zip(functions, options, strict=True)))
+
+
+def _begin(plan: waypoint.WaypointPlan, current: waypoint.Pose, carried: jax.Array) -> waypoint.Progress:
+    return waypoint.begin_plan(plan, waypoint.start_reference(current, carried))
 
 
 def _on_cpu(function: Callable[..., Any]) -> Callable[..., Any]:

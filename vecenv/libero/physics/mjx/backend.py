@@ -276,6 +276,7 @@ class MjxPhysics(Physics[MjxGroup]):
         max_misses: int | None = None,
         watchers: Sequence[Watcher] = (),
         until_success: bool = True,
+        reference: np.ndarray | None = None,
     ) -> FollowResult:
         """Follow plans in one compiled call a scene; see ``Physics.follow``.
 
@@ -284,10 +285,12 @@ class MjxPhysics(Physics[MjxGroup]):
         longest = np.where(plan.valid, np.where(plan.hold > 0, plan.hold, config.max_steps), 0).sum(1)
         traced = int(min(longest.max(initial=0), limit.max(initial=0))) if watchers else 0
         misses = jnp.int32(2**30 if max_misses is None else max_misses)
+        carried = np.full((self.num_envs, 7), np.nan) if reference is None else reference
 
         def call(group: MjxGroup) -> tuple[Loop, Any]:
             group_plan = jax.tree.map(lambda x: group.put(np.asarray(x)[group.slots]), plan)
             rows = group_plan, group.put_mask(active[group.slots]), group.put(limit[group.slots])
+            rows = *rows, group.put(carried[group.slots])
             follow = group.compiled.follow(config, traced, until_success)
             with group.compiling("waypoints", config, traced, until_success, plan.valid.shape[1]):
                 loop, *rest = follow(group.system, misses, _table(group), group.worlds, *rows)
@@ -295,11 +298,12 @@ class MjxPhysics(Physics[MjxGroup]):
 
         ran, results = self._each(active, call)
         converged = np.zeros(plan.valid.shape, bool)
-        ticks = np.zeros(plan.valid.shape, int)
+        ticks, ended = np.zeros(plan.valid.shape, int), carried.copy()
         for group, (progress, _) in results:
             converged[group.slots], ticks[group.slots] = group.get(progress.converged), group.get(progress.ticks)
+            ended[group.slots] = np.concatenate([group.get(part) for part in progress.reference], axis=1)
         _replay(watchers, traced, self.num_envs, [(group, trace) for group, (_, trace) in results])
-        return FollowResult(**vars(ran), converged=converged, waypoint_ticks=ticks)
+        return FollowResult(**vars(ran), converged=converged, waypoint_ticks=ticks, reference=ended)
 
     def _each(
         self, active: np.ndarray, call: Callable[[MjxGroup], tuple[Loop, Any]]

@@ -119,9 +119,10 @@ def _follow(
     plan: waypoint.WaypointPlan,
     active: jax.Array,
     limit: jax.Array,
+    carried: jax.Array,
     **options: Any,
 ) -> tuple[Loop, waypoint.Progress, Trace]:
-    return follow_plan(system, table, worlds, plan, active, limit, max_misses, **options)
+    return follow_plan(system, table, worlds, plan, active, limit, max_misses, carried, **options)
 
 
 def _merge(mask: jax.Array, new: World, old: World) -> World:

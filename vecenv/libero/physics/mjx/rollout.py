@@ -110,6 +110,7 @@ def follow_plan(
     active: jax.Array,
     limit: jax.Array,
     max_misses: jax.Array,
+    carried: jax.Array,
     *,
     sites: tuple[int, int],
     config: waypoint.WaypointConfig,
@@ -126,13 +127,13 @@ def follow_plan(
         active: worlds that take part, bool [n].
         limit: control steps each world may still take, int [n].
         max_misses: waypoints in a row that may time out before a world stops.
+        carried: where the servo's references start, [n, 7]; at the end effectors in rows of NaN.
         sites: ids of the grip site and the hand body.
         config: tolerances and speeds.
         traced: ticks to record.
         until_success: whether a world stops at success.
     """
-    current = eef(worlds, *sites)
-    progress = waypoint.begin_plan(plan, current)
+    progress = waypoint.begin_plan(plan, waypoint.start_reference(eef(worlds, *sites), carried))
     act = _batched(system, partial(waypoint.plan_action, config=config))
     advance = _batched(system, partial(waypoint.plan_advance, config=config))
     trace = Trace(jnp.zeros((*active.shape, traced, 7)), jnp.zeros((*active.shape, traced), bool))
@@ -145,7 +146,7 @@ def follow_plan(
     ) -> tuple[Loop, waypoint.Progress, Trace, jax.Array]:
         loop, progress, trace, count = carry
         moved = moving(loop, progress)
-        actions, progress = act(plan, progress, eef(loop.worlds, *sites))
+        actions, progress = act(plan, progress, eef(loop.worlds, *sites), moved)
         loop = _tick(system, table, limit, loop, actions, moved, until_success)
         progress = advance(plan, progress, eef(loop.worlds, *sites), moved)
         if traced:

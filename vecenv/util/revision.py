@@ -1,0 +1,23 @@
+"""The commit that this code runs from, for records of what was run."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+
+def git_commit(folder: Path = Path(__file__).parent) -> str:
+    """Commit of the clone that a folder is in, this package's by default, with ``+changes`` when files differ from it.
+
+    Empty outside a clone.
+    """
+    try:
+        commit = _git("rev-parse", "HEAD", cwd=folder)
+        return commit + ("+changes" if _git("status", "--porcelain", "--untracked-files=no", cwd=folder) else "")
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def _git(*arguments: str, cwd: Path) -> str:
+    done = subprocess.run(["git", *arguments], cwd=cwd, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
