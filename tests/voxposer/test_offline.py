@@ -157,7 +157,7 @@ def test_simpler_drawers_open_and_close() -> None:
         ("move the plate to the stove's front", ["put the plate front_of the stove"]),
         ("push the plate to the front of the stove", ["push the plate front_of the stove"]),
         ("pick up the butter", ["pick the butter"]),
-        ("close the bottom drawer and open the top one", ["close the bottom drawer", "open the top one"]),
+        ("close the bottom drawer and open the top one", ["close the bottom drawer", "open the top drawer"]),
     ],
 )
 def test_instructions_are_parsed(instruction: str, actions: list[str]) -> None:

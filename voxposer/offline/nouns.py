@@ -1,0 +1,539 @@
+"""Noun phrases: "the second bowl from the left", "all cans except the red one", "the mug that is closest to it".
+
+A cursor comes in; a :class:`~voxposer.offline.meaning.Noun` goes out, and the prepositional phrases behind it as
+:class:`Phrase` s: whether such a phrase describes the object or says where to put it is for the clause to decide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from voxposer.offline.lexicon import (
+    ALL,
+    ARTICLES,
+    EXCEPTIONS,
+    FARTHEST,
+    GERUNDS,
+    INDEFINITE,
+    MODALS,
+    NEAREST,
+    NUMBERS,
+    ORDERS,
+    ORDINALS,
+    PARTICLES,
+    PREPOSITIONS,
+    SIDE_WORDS,
+    STATES,
+    UNITS,
+)
+from voxposer.offline.meaning import Noun, Ranking, Relation
+from voxposer.offline.names import COLOURS, NotUnderstood, singular
+from voxposer.offline.tokens import Cursor, is_side_end
+
+# Words that end the words of a noun phrase.
+_STOPS = (
+    frozenset(phrase[0] for phrase in PREPOSITIONS if phrase[0] not in SIDE_WORDS)
+    | frozenset(phrase[0] for phrase in MODALS if phrase[0] not in {"can", "will", "may", "might"})
+    | NEAREST
+    | FARTHEST
+    | (PARTICLES - {"back"})
+    | frozenset(
+        """and or but then not that which who whose except excluding without before after once while when as is are was
+        were be been goes go belongs belong of , . ( ) where than so if until unless nor neither besides apart other
+        again at you we i has have had need needs there here halfway midway somewhere immediately""".split()
+    )
+)
+_RELATIVES = ("that", "which", "who")
+_LINKS = ("is", "are", "was", "were", "lies", "lie", "sits", "sit", "stands", "stand", "lay", "stood", "rests")
+_PARTITIVES = frozenset(["piece", "stick", "pat", "slice", "bit", "unit", "item", "kind"])
+_MODIFIERS = frozenset(["from", "outside", "center", "between"])
+PLACES = frozenset(
+    "on in top_of under near left_of right_of front_of back_of between center to towards".split()
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phrase:
+    """A prepositional phrase.
+
+    Attributes:
+        kind: the relation.
+        thing: the object, None where it is implied ("put the bowl inside").
+        second: for between, the other object.
+        negated: "not in the basket".
+        cm: "10 cm to the left of the basket", or None.
+        said: the preposition as it was said.
+    """
+
+    kind: str
+    thing: Noun | None = None
+    second: Noun | None = None
+    negated: bool = False
+    cm: float | None = None
+    said: str = ""
+
+
+def read_noun_phrase(cursor: Cursor, *, inner: bool = False) -> Noun | None:
+    """A noun phrase without the prepositional phrases behind it; None if there is none here.
+
+    Args:
+        cursor: where to read.
+        inner: inside another noun phrase, to which "besides" belongs.
+    """
+    start = cursor.at
+    noun = _head(cursor)
+    if noun is None:
+        cursor.at = start
+        return None
+    return _with_modifiers(cursor, noun, inner)
+
+
+def read_phrases(cursor: Cursor, *, inner: bool = False) -> list[Phrase]:
+    """The prepositional phrases that come next."""
+    found = []
+    while (phrase := read_phrase(cursor, inner=inner)) is not None:
+        found.append(phrase)
+    return found
+
+
+def read_phrase(cursor: Cursor, *, inner: bool = False) -> Phrase | None:
+    """The prepositional phrase that comes next, None if there is none."""
+    start = cursor.at
+    negated = cursor.take("not")
+    cm = read_length(cursor)
+    cursor.take("away", "further", "farther")
+    if cm is not None:
+        cursor.take("and")
+    cursor.take("halfway", "midway", "half way", "exactly", "somewhere", "right", "immediately") if cm is None else None
+    said = cursor.rest
+    kind = cursor.take_meaning(PREPOSITIONS)
+    if kind is None or (cm is not None and kind not in PLACES | {"from"}) or _ends_bare(cursor, kind):
+        cursor.at = start
+        return None
+    words = said[: len(said) - len(cursor.rest)].strip()
+    if kind in {"to", "towards"} and (side := _bare_side(cursor)):
+        return Phrase(kind=f"{side}_of", cm=cm, negated=negated, said=f"{words} the {side}")
+    if cm is not None and kind == "from":
+        kind = "near"
+    thing = read_noun_phrase(cursor, inner=inner)
+    second = None
+    if kind == "between":
+        second = read_noun_phrase(cursor, inner=inner) if cursor.take("and") else None
+        if second is None and not (thing and (thing.plural or thing.words == ("them",))):
+            raise NotUnderstood("'between' needs two objects")
+    if kind == "center" and thing is not None and thing.words[-1] == "workspace":
+        thing = Noun(words=("table",))
+    return Phrase(kind=kind, thing=thing, second=second, negated=negated, cm=cm, said=words)
+
+
+def _bare_side(cursor: Cursor) -> str:
+    """A side with nothing behind it, "to the right"; "" if there is none here."""
+    start = cursor.at
+    cursor.take("the")
+    side = SIDE_WORDS.get(cursor.next(), "")
+    cursor.take("hand side", "side")
+    if side in {"left", "right", "front", "back"} and is_side_end(cursor):
+        return side
+    cursor.at = start
+    return ""
+
+
+def _ends_bare(cursor: Cursor, kind: str) -> bool:
+    """A preposition with nothing behind it that can do without only at some places: "put it in" but not "between"."""
+    return kind in {"to", "from", "towards"} and cursor.at_end
+
+
+def read_length(cursor: Cursor) -> float | None:
+    """A length in centimetres: "10 cm", "two inches", "half a foot", "a little"; None if there is none here."""
+    start = cursor.at
+    cursor.take("about", "around", "roughly", "approximately", "exactly", "by", "at least", "some", "for")
+    cursor.take("about", "around", "roughly", "approximately", "exactly", "at least")
+    if cursor.take("a little bit", "a little", "a bit", "slightly", "a tad") and not _is_word(cursor.peek()):
+        return 5.0
+    half = cursor.take("half a", "half an")
+    token = cursor.next()
+    number = 0.5 if half else _number(token)
+    if half:
+        cursor.at -= 1
+    elif number is not None and cursor.take("and a half"):
+        number += 0.5
+    unit = UNITS.get(cursor.peek())
+    if number is None or unit is None:
+        cursor.at = start
+        return None
+    cursor.next()
+    if cursor.take("and a half"):
+        number += 0.5
+    return number * unit
+
+
+def _number(token: str) -> float | None:
+    if token in {"a", "an"}:
+        return 1.0
+    if token in NUMBERS:
+        return float(NUMBERS[token])
+    try:
+        return float(token.replace(",", ".")) if token[:1].isdigit() and token.isascii() else None
+    except ValueError:
+        return None
+
+
+def _is_word(token: str) -> bool:
+    """Whether a token can be a word of a name."""
+    return bool(token) and (token[0].isalnum()) and token not in _STOPS
+
+
+# -- the words before and of the noun ----------------------------------------------------------------------------------
+
+
+@dataclass
+class _Determiner:
+    """What stands before the words of a noun."""
+
+    given: bool = False
+    definite: bool = False
+    said: bool = False
+    plural: bool = False
+    indefinite: bool = False
+    number: int | None = None
+    exact: bool = False
+    other: bool = False
+    ordinal: int | None = None
+    key: str = ""
+
+
+def _determiner(cursor: Cursor) -> _Determiner:
+    found = _Determiner()
+    while True:
+        token, after = cursor.peek(), cursor.peek(1)
+        if token in {"one", "any", "each", "all", "both", "either"} and after == "of":
+            cursor.at += 2
+            found.indefinite |= token in {"one", "any", "either"}
+            found.plural |= token in {"each", "all", "both"}
+            found.number, found.exact = (2, True) if token == "both" else (found.number, found.exact)
+        elif token in ARTICLES and not (token == "that" and after in _LINKS):
+            found.definite, found.said = True, token in {"that", "this", "these", "those"}
+            cursor.next()
+        elif token in INDEFINITE:
+            found.indefinite = True
+            found.other |= token == "another"
+            cursor.next()
+        elif token == "both":
+            found.plural, found.number, found.exact = True, 2, True
+            cursor.next()
+        elif token in ALL:
+            found.plural = True
+            cursor.next()
+        elif (token in NUMBERS or token.isdecimal()) and (found.plural or _counts(cursor)):
+            found.number = NUMBERS[token] if token in NUMBERS else int(token)
+            found.exact |= found.definite or found.plural
+            cursor.next()
+        elif token in {"other", "remaining"}:
+            found.other = True
+            cursor.next()
+        elif not _take_order(cursor, found):
+            return found
+        found.given = True
+
+
+def _counts(cursor: Cursor) -> bool:
+    """Whether a number counts things: a word of a name, or of their order, follows."""
+    after = cursor.peek(1)
+    known = _is_word(after) and after not in UNITS
+    return known or after in NEAREST | FARTHEST | {"other"} or (cursor.peek() != "one" and after == "of")
+
+
+def _take_order(cursor: Cursor, found: _Determiner) -> bool:
+    """An ordinal or a superlative."""
+    token = cursor.peek()
+    if token in ORDINALS and found.ordinal is None and cursor.peek(1) not in {",", ".", ""}:
+        found.ordinal = ORDINALS[token]
+    elif token in ORDERS and not found.key:
+        found.key = ORDERS[token]
+    elif token in NEAREST | FARTHEST and not found.key and found.given:
+        found.key = "near" if token in NEAREST else "far"
+    else:
+        return False
+    cursor.next()
+    return True
+
+
+def _head(cursor: Cursor) -> Noun | None:
+    """Determiner, words and "of ..."."""
+    start = cursor.at
+    if cursor.take("each other", "one another"):
+        return Noun(words=("each other",))
+    found = _determiner(cursor)
+    words, excluded = _words(cursor)
+    among = not words and bool(found.key or found.ordinal) and found.number is None
+    if not words and (pronoun := _lone(cursor, found, start)) is not None:
+        return pronoun
+    number, exact, plural = found.number, found.exact, found.plural
+    while cursor.peek() == "of" or (not words and found.key and cursor.sees("one of")):
+        cursor.take("one")
+        cursor.next()
+        inner = _determiner(cursor)
+        more, others = _words(cursor)
+        if not more:
+            raise NotUnderstood(f"what is {' '.join(cursor.tokens[start : cursor.at])!r} of?")
+        partitive = bool(words) and all(singular(word) in _PARTITIVES for word in words)
+        words = more if partitive or not words else [*more, *words]
+        excluded += others
+        number = number if inner.number is None else inner.number
+        exact |= inner.number is not None
+    if not words:
+        return None
+    plural |= words[-1] != singular(words[-1]) or words[-1] in {"everything", "them", "they"}
+    plural &= not among
+    return _noun(found, words, excluded, plural=plural, number=number, exact=exact)
+
+
+def _noun(
+    found: _Determiner, words: list[str], excluded: list[str], *, plural: bool, number: int | None, exact: bool
+) -> Noun:
+    key, ordinal = found.key, found.ordinal
+    ranking = Ranking(key=key, rank=ordinal or 1) if key else None
+    if ordinal is not None and not key:
+        ranking = Ranking(key="", rank=ordinal)
+    many = plural and not (found.indefinite and not found.number)
+    single = number == 1 and not exact
+    return Noun(
+        words=tuple(map(singular, words)),
+        ranking=ranking,
+        plural=many and not single,
+        indefinite=found.indefinite or single,
+        number=number,
+        exact=exact,
+        excluded=tuple(Noun(words=(word,)) for word in excluded),
+        other=found.other,
+        said=found.said,
+    )
+
+
+def _lone(cursor: Cursor, found: _Determiner, start: int) -> Noun | None:
+    """Determiners that stand alone: "both", "all", "that", "the other", "the second"."""
+    if found.key or found.ordinal is not None:
+        if cursor.sees("of", "one of"):
+            return None
+        return Noun(words=("one",), ranking=Ranking(key=found.key, rank=found.ordinal or 1), number=found.number)
+    if found.other:
+        return Noun(words=("one",), other=True, plural=found.plural)
+    if found.number is not None and found.plural:
+        return Noun(words=("them",), plural=True, number=found.number, exact=True)
+    if found.plural:
+        return Noun(words=("them",), plural=True)
+    token = cursor.tokens[start] if start < len(cursor.tokens) else ""
+    if found.said and cursor.at == start + 1:
+        return Noun(words=(token,), plural=token in {"these", "those"})
+    if token == "the" and cursor.at == start + 1 and cursor.sees(*NEAREST, *FARTHEST):
+        return Noun(words=("one",))
+    return None
+
+
+def _words(cursor: Cursor) -> tuple[list[str], list[str]]:
+    """Words of a name, and those that it must not have ("non-red")."""
+    words: list[str] = []
+    excluded: list[str] = []
+    while True:
+        token = cursor.peek()
+        if token in {"non", "not"} and not words and cursor.peek(1) in COLOURS:
+            excluded.append(cursor.peek(1))
+            cursor.at += 2
+        elif token == "and" and words and words[-1] in COLOURS and cursor.peek(1) in COLOURS:
+            cursor.next()
+        elif token in STATES and words and not _is_word(cursor.peek(1)):
+            return words, excluded
+        elif token in SIDE_WORDS and tuple(cursor.tokens[cursor.at : cursor.at + 2])[1:] == ("of",) and words:
+            return words, excluded
+        elif not _is_word(token) or (words and words[-1] in {"it", "them", "itself", "there", "they"}):
+            return words, excluded
+        elif words and (token in NUMBERS or token[0].isdigit()) and cursor.peek(1) in UNITS:
+            return words, excluded
+        elif words and token in {"can", "will", "may", "might", "could"} and cursor.peek(1) in {"be", "go", "not"}:
+            return words, excluded
+        elif words and token in GERUNDS:
+            return words, excluded
+        else:
+            words.append(cursor.next())
+
+
+# -- what stands behind the noun ---------------------------------------------------------------------------------------
+
+
+def _with_modifiers(cursor: Cursor, noun: Noun, inner: bool) -> Noun:
+    """A noun with what describes it behind it, prepositional phrases aside."""
+    while True:
+        start = cursor.at
+        changed = (
+            _relative(cursor, noun)
+            or _ranked_from(cursor, noun)
+            or _side(cursor, noun)
+            or _distance(cursor, noun)
+            or _exclusion(cursor, noun)
+            or (None if inner else _moved(cursor, noun))
+        )
+        if changed is None:
+            cursor.at = start
+            return noun
+        noun = changed
+
+
+def _relative(cursor: Cursor, noun: Noun) -> Noun | None:
+    """ "that is ...", "which is not red", between commas or not."""
+    comma = cursor.peek() == "," and cursor.peek(1) in _RELATIVES
+    if comma:
+        cursor.next()
+    if not (cursor.take_any(_RELATIVES) and cursor.take_any(_LINKS)):
+        return None
+    cursor.take("located", "placed", "standing", "lying", "sitting", "currently", "the one")
+    negated = cursor.take("not")
+    if negated:
+        changed = _excluding(cursor, noun)
+    else:
+        changed = _side(cursor, noun) or _distance(cursor, noun) or _adjective(cursor, noun)
+    if changed is None:
+        phrase = read_phrase(cursor, inner=True)
+        if phrase is None:
+            raise NotUnderstood(f"{cursor.rest!r} does not describe {noun}")
+        changed = qualified(noun, [replace(phrase, negated=phrase.negated or negated)])
+    if comma:
+        cursor.take(",")
+    return changed
+
+
+def _adjective(cursor: Cursor, noun: Noun) -> Noun | None:
+    """ "that is red", "that is the largest"."""
+    start = cursor.at
+    cursor.take("the")
+    if cursor.peek() in ORDERS:
+        return replace(noun, ranking=Ranking(key=ORDERS[cursor.next()]))
+    if cursor.peek() in COLOURS:
+        return replace(noun, words=(cursor.next(), *noun.words))
+    cursor.at = start
+    return None
+
+
+def _excluding(cursor: Cursor, noun: Noun) -> Noun | None:
+    """ "not red", "not the left one": what is excluded."""
+    start = cursor.at
+    if cursor.peek() in COLOURS and not _is_word(cursor.peek(1)):
+        return replace(noun, excluded=(*noun.excluded, Noun(words=(cursor.next(),))))
+    ranked = replace(noun, ranking=None, excluded=(), plural=False, number=None)
+    side = _side(cursor, ranked) or _distance(cursor, ranked)
+    if side is not None:
+        return replace(noun, excluded=(*noun.excluded, side))
+    cursor.at = start
+    other = read_noun_phrase(cursor, inner=True) if cursor.peek() in ARTICLES else None
+    if other is not None:
+        return replace(noun, excluded=(*noun.excluded, other))
+    cursor.at = start
+    return None
+
+
+def _ranked_from(cursor: Cursor, noun: Noun) -> Noun | None:
+    """ "the second bowl from the left": where the counting starts."""
+    ranking = noun.ranking
+    if ranking is None or ranking.key:
+        return None
+    start = cursor.at
+    side = SIDE_WORDS.get(cursor.next()) if cursor.take("from the", "counting from the", "counted from the") else None
+    if side is None or cursor.peek() == "of":
+        cursor.at = start
+        return None
+    cursor.take("side")
+    return replace(noun, ranking=replace(ranking, key=side))
+
+
+def _side(cursor: Cursor, noun: Noun) -> Noun | None:
+    """ "on the left": the side that tells one of several."""
+    start = cursor.at
+    hand = cursor.take("on the", "at the", "in the", "from the", "on your", "on my")
+    cursor.take("far", "very", "left hand", "right hand") if hand else None
+    side = SIDE_WORDS.get(cursor.peek()) if hand else None
+    if side is None:
+        cursor.at = start
+        return None
+    cursor.next()
+    cursor.take("hand")
+    cursor.take("side")
+    if not is_side_end(cursor) or (noun.ranking is not None and noun.ranking.key):
+        cursor.at = start
+        return None
+    return replace(noun, ranking=Ranking(key=side, rank=noun.ranking.rank if noun.ranking else 1))
+
+
+def _distance(cursor: Cursor, noun: Noun) -> Noun | None:
+    """ "nearest to the plate", "further back", "the furthest to the right"."""
+    start = cursor.at
+    cursor.take("the")
+    word = cursor.take_any(NEAREST | FARTHEST)
+    key = "near" if word in NEAREST else "far"
+    if not word:
+        if noun.ranking is None or noun.ranking.key not in {"near", "far"} or noun.ranking.ref is not None:
+            cursor.at = start
+            return None
+        key = noun.ranking.key
+    rank = noun.ranking.rank if noun.ranking else 1
+    cursor.take("away")
+    side_at = cursor.at
+    cursor.take("to the", "on the", "at the", "towards the", "in the")
+    side = SIDE_WORDS.get(cursor.peek())
+    if word and side and cursor.peek(1) != "of":
+        cursor.next()
+        cursor.take("side")
+        return replace(noun, ranking=Ranking(key=side, rank=rank))
+    cursor.at = side_at
+    ref = read_noun_phrase(cursor, inner=True) if cursor.take("to", "from") else None
+    if ref is None:
+        cursor.at = start
+        return None
+    return replace(noun, ranking=Ranking(key=key, rank=rank, ref=ref))
+
+
+def _exclusion(cursor: Cursor, noun: Noun) -> Noun | None:
+    """ "except the red one", "all but the left one", "not red", "without yellow"."""
+    start = cursor.at
+    cursor.take(",")
+    many = noun.plural or noun.indefinite
+    for phrase in EXCEPTIONS:
+        if cursor.sees(phrase) and (phrase != "but" or many) and not (phrase == "besides" and _sees_moved(cursor)):
+            cursor.take(phrase)
+            return _excluding(cursor, noun)
+    if cursor.take("without", "not") and cursor.peek() in COLOURS:
+        return _excluding(cursor, noun)
+    cursor.at = start
+    return None
+
+
+def _sees_moved(cursor: Cursor) -> bool:
+    return cursor.sees("besides the") and cursor.peek(2).isdecimal()
+
+
+def _moved(cursor: Cursor, noun: Noun) -> Noun | None:
+    """ "besides the 1 on the plate": how the planner says which are done already."""
+    if not _sees_moved(cursor):
+        return None
+    cursor.at += 2
+    count = int(cursor.next())
+    phrase = read_phrase(cursor, inner=True)
+    if phrase is None:
+        return None
+    relation = qualified(noun, [phrase]).relation
+    assert relation is not None
+    return replace(noun, moved=(*noun.moved, (count, relation)))
+
+
+def qualified(noun: Noun, phrases: list[Phrase]) -> Noun:
+    """A noun with its prepositional phrases nested as its relation: each describes the noun before it."""
+    if not phrases:
+        return noun
+    first, *rest = phrases
+    if first.thing is None:
+        raise NotUnderstood(f"'{first.said}' has no object")
+    if first.kind not in PLACES | _MODIFIERS or first.kind in {"to", "towards"}:
+        raise NotUnderstood(f"'{first.said} {first.thing}' does not describe an object")
+    if noun.relation is not None:
+        raise NotUnderstood(f"{noun} has two descriptions of its place; say one")
+    thing = qualified(first.thing, rest)
+    refs = (thing,) if first.second is None else (first.thing, qualified(first.second, rest))
+    return replace(noun, relation=Relation(kind=first.kind, refs=refs, negated=first.negated))
