@@ -8,11 +8,13 @@ should be ("the bowl belongs on the plate") become the same clauses. What pronou
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from voxposer.offline.lexicon import (
     AFTER,
+    ARTICLES,
     BEFORE,
+    EXCEPTIONS,
     FILLERS,
     GERUNDS,
     GOES,
@@ -21,13 +23,15 @@ from voxposer.offline.lexicon import (
     PARTICIPLES,
     POLITE,
     QUESTIONS,
+    SIDE_WORDS,
+    SIZES,
     SPEEDS,
     STATES,
     THEN,
     VERBS,
 )
 from voxposer.offline.meaning import Noun
-from voxposer.offline.names import NotUnderstood
+from voxposer.offline.names import COLOURS, NotUnderstood
 from voxposer.offline.nouns import Phrase, read_length, read_noun_phrase, read_phrase, read_phrases
 from voxposer.offline.tokens import Cursor
 
@@ -79,7 +83,7 @@ def _without_manner(tokens: list[str]) -> tuple[list[str], float | None]:
             if speed is not None and found != speed:
                 raise NotUnderstood("two different speeds are asked for")
             speed = found
-        elif (kept and kept[-1] not in {"the", "a"}) and cursor.take_longest(FILLERS):
+        elif kept and kept[-1] not in {"the", "a"} and not cursor.sees("instead of") and cursor.take_longest(FILLERS):
             continue
         elif not (cursor.peek() in {",", "."} and (not kept or kept[-1] in {",", "."})):
             kept.append(cursor.next())
@@ -120,6 +124,7 @@ class _Sentence:
     def __init__(self, cursor: Cursor) -> None:
         self._cursor = cursor
         self._clauses: list[Clause] = []
+        self._after: float | None = None
 
     def read(self) -> list[Clause]:
         while True:
@@ -165,6 +170,10 @@ class _Sentence:
         """Read a clause, and put it where it belongs in the order."""
         cursor = self._cursor
         last = max((clause.when for clause in self._clauses), default=0.0)
+        if self._clauses and cursor.take("before that", "before this", "beforehand", "before doing that", "before doing so"):
+            self._separator()
+            self._clause(self._clauses[-1].when - 0.5)
+            return
         if cursor.take(*BEFORE):
             later = self._subordinate(last + 1)
             if fresh:
@@ -172,10 +181,25 @@ class _Sentence:
                 self._clause(later.when - 0.5)
             return
         leading = fresh
-        if self._takes_after():
+        joined, self._after = self._after, None
+        if joined is not None and not fresh and cursor.tokens[cursor.at - 1] == "and" and not self._starts_order():
+            self._after = joined + 0.05
+            self._subordinate(self._after)
+        elif leading and self._clauses and cursor.take("after doing that", "after doing so", "once done with that"):
+            self._separator()
+            self._main(first, last)
+        elif self._takes_after():
             before = self._clauses[-1].when - 0.25 if self._clauses and not leading else last + 1
             self._subordinate(before)
-            return
+            self._after = before if not leading else None
+        else:
+            self._main(first, last)
+
+    def _starts_order(self) -> bool:
+        """Whether an imperative comes next."""
+        return self._cursor.peek() in VERBS
+
+    def _main(self, first: bool, last: float) -> None:
         self._clause(self._clauses[-1].when - 0.5 if first and self._clauses else last + 1)
 
     def _takes_after(self) -> bool:
@@ -199,7 +223,8 @@ class _Sentence:
     def _ruled_out(self, clause: Clause) -> None:
         """ ", not on the left plate", ", but not the top one"."""
         cursor = self._cursor
-        while cursor.take(", but not", "but not", ", not", "not", ", and not", "and not"):
+        while cursor.take(", rather than", "rather than", ", instead of", "instead of", ", but not", "but not", ", not", "not", ", and not", "and not") or self._exception():
+            cursor.take_any(GERUNDS)
             phrase = read_phrase(cursor)
             noun = read_noun_phrase(cursor) if phrase is None else None
             if phrase is None and noun is None:
@@ -209,12 +234,22 @@ class _Sentence:
                 cursor.next()
 
 
+    def _exception(self) -> bool:
+        """ "put all cans in the basket except the red one"."""
+        start = self._cursor.at
+        self._cursor.take(",")
+        if self._cursor.take(*(phrase for phrase in EXCEPTIONS if phrase != "but")):
+            return True
+        self._cursor.at = start
+        return False
+
+
 # -- one clause --------------------------------------------------------------------------------------------------------
 
 
 def _read_clause(cursor: Cursor, *, past: bool, follows: bool) -> Clause:
     start = cursor.at
-    for reader in (_question, _forbidden, _constraint, _same, _imperative(past), _fronted, _wish, _statement):
+    for reader in (_question, _forbidden, _constraint, _same, _imperative(past), _fronted, _wish, _statement(past)):
         clause = reader(cursor)
         if clause is not None:
             return clause
@@ -477,25 +512,64 @@ def _wish(cursor: Cursor) -> Clause | None:
     return Clause("put" if any(phrases for _, phrases in groups) else "pick", groups)
 
 
-def _statement(cursor: Cursor) -> Clause | None:
-    """ "the bowl should be put on the plate", "the bowl belongs on the plate"; questions have the verb first."""
-    asked = cursor.take("could", "can", "should", "would", "will", "must", "may", "shall")
-    groups = _groups(cursor)
-    if not groups or groups[0][0] is None:
+def _statement(past: bool) -> Callable[[Cursor], Clause | None]:
+    """A reader of "the bowl should be put on the plate", "the bowl belongs on the plate", and of such questions.
+
+    What is, or was done, is an order in the past only: "after the bowl has been put on the plate".
+    """
+
+    def read(cursor: Cursor) -> Clause | None:
+        if cursor.take("could", "can", "should", "would", "will", "must", "may", "shall"):
+            return _asked(cursor)
+        start = cursor.at
+        groups = _groups(cursor, subject=True)
+        if not groups or groups[0][0] is None:
+            return None
+        ordered = bool(_modals(cursor)) or cursor.tokens[max(start - 1, 0)] in _ASSURED
+        linked = cursor.take_any(_LINKS) != ""
+        while cursor.take_any(_LINKS):
+            continue
+        if cursor.take("stay", "stays", "remain", "remains"):
+            return _staying(cursor, groups)
+        if cursor.take_any(GOES):
+            cursor.take("up")
+            return _predicate(cursor, groups)
+        if not (ordered or linked):
+            return None
+        done = past and cursor.peek() in PARTICIPLES
+        if not (ordered or done or cursor.sees("to be", "not to be", "to go")):
+            raise NotUnderstood(f"{' '.join(cursor.tokens[start:])!r} says what is, not what to do")
+        return _predicate(cursor, groups)
+
+    return read
+
+
+_LINKS = frozenset(["has", "have", "is", "are", "gets", "get", "was", "were", "been", "being"])
+# The last words of "make sure that", "see to it that" and the like.
+_ASSURED = frozenset(["sure", "that"])
+
+
+def _modals(cursor: Cursor) -> int:
+    """Take "should", "needs to" and the like; how many."""
+    count = 0
+    while cursor.take_longest(MODALS):
+        count += 1
+    return count
+
+
+def _asked(cursor: Cursor) -> Clause | None:
+    """ "could the mug be put on the plate": up to "be" it is the subject."""
+    ends = [index for index in range(cursor.at, len(cursor.tokens)) if cursor.tokens[index] in {"be", "go", "please"}]
+    if not ends:
         return None
-    if asked:
-        cursor.take("please")
-        return _predicate(cursor, groups)
-    linked = False
-    while cursor.take_longest(MODALS) or cursor.take_any({"has", "have", "is", "are", "gets", "get", "was", "were"}):
-        linked = True
-    if cursor.take("stay", "stays", "remain", "remains"):
-        return _staying(cursor, groups)
-    if cursor.peek() in GOES:
-        cursor.next()
-        cursor.take("up")
-        return _predicate(cursor, groups)
-    return _predicate(cursor, groups) if linked else None
+    subject = Cursor(cursor.tokens[cursor.at : ends[0]])
+    groups = _groups(subject, subject=True)
+    if not subject.at_end or groups[0][0] is None:
+        return None
+    cursor.at = ends[0]
+    cursor.take("please")
+    cursor.take("go")
+    return _predicate(cursor, groups)
 
 
 def _staying(cursor: Cursor, groups: list[Group]) -> Clause | None:
@@ -557,7 +631,7 @@ def _elliptic(cursor: Cursor) -> Clause | None:
         return Clause(f"turn_{state}" if state in {"on", "off"} else state, [(None, [])])
     start = cursor.at
     groups = _groups(cursor)
-    if groups and groups[0][0] is not None and cursor.at > start:
+    if groups and groups[0][0] is not None and not groups[0][0].is_pronoun and cursor.at > start:
         return Clause("again", groups)
     return None
 
@@ -565,15 +639,37 @@ def _elliptic(cursor: Cursor) -> Clause | None:
 # -- groups ------------------------------------------------------------------------------------------------------------
 
 
-def _groups(cursor: Cursor) -> list[Group]:
-    """Noun phrases joined by "and" or commas, each with the prepositional phrases behind it."""
+def _groups(cursor: Cursor, *, subject: bool = False) -> list[Group]:
+    """Noun phrases joined by "and" or commas, each with the prepositional phrases behind it.
+
+    Args:
+        cursor: where to read.
+        subject: whether they are the subject of a statement, so that what follows an "and" may be one too.
+    """
     cursor.take("both") if _is_pair(cursor) else None
     found = [_group(cursor)]
-    while _joins(cursor):
+    while _joins(cursor, subject):
         found.append(_group(cursor))
+    _share_head(found)
     if cursor.sees("or", ", or", "and or", "nor"):
         raise NotUnderstood(f"'or' leaves open which: {' '.join(cursor.tokens)!r}")
     return found
+
+
+def _share_head(groups: list[Group]) -> None:
+    """ "The left and the right bowl": the noun of the last one is that of those before."""
+    for index in range(len(groups) - 2, -1, -1):
+        (noun, phrases), (after, later) = groups[index], groups[index + 1]
+        if noun is None or after is None or phrases or not set(noun.words) <= _ADJECTIVES or noun.is_pronoun:
+            continue
+        if noun.words == ("one",) and noun.ranking is None:
+            continue
+        words = tuple(word for word in noun.words if word != "one")
+        groups[index] = (replace(noun, words=(*words, after.words[-1]), plural=False), phrases)
+        groups[index + 1] = (replace(after, plural=False) if after.number is None else after, later)
+
+
+_ADJECTIVES = frozenset([*SIDE_WORDS, *COLOURS, *SIZES, "one"])
 
 
 def _is_pair(cursor: Cursor) -> bool:
@@ -583,7 +679,8 @@ def _is_pair(cursor: Cursor) -> bool:
     start = cursor.at
     cursor.next()
     first = read_noun_phrase(cursor)
-    pair = first is not None and not first.plural and cursor.sees("and")
+    named = cursor.tokens[start + 1 : start + 2] != [] and cursor.tokens[start + 1] in ARTICLES
+    pair = first is not None and (named or not first.plural) and cursor.sees("and")
     cursor.at = start
     return pair
 
@@ -609,7 +706,7 @@ def _group(cursor: Cursor) -> Group:
     return noun, phrases
 
 
-def _joins(cursor: Cursor) -> bool:
+def _joins(cursor: Cursor, subject: bool) -> bool:
     """Take "and", a comma or both, if another noun phrase of the same clause follows."""
     start = cursor.at
     if not cursor.take(", and", ", as well as", "as well as", "and also", "and", ",", "along with", "together with"):
@@ -621,7 +718,7 @@ def _joins(cursor: Cursor) -> bool:
                  "first", "lastly", "", ".", "avoiding", "keeping", "staying", "do", "never", "when", "so", "i", "also",
                  "which", "who", "having", "afterwards", "later", "leaving", "nor", "stay", "steer", "with", "don't",
                  "instead", "if", "until", "is", "are", "finally", "turn_on"}  # fmt: skip
-        if ahead not in stops and ahead not in GERUNDS and not _states_something(cursor):
+        if ahead not in stops and ahead not in GERUNDS and (subject or not _states_something(cursor)):
             cursor.at = both
             return True
     cursor.at = start

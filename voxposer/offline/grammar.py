@@ -60,9 +60,11 @@ def read_noun(text: str) -> Noun:
     if noun is not None:
         phrases = read_phrases(cursor, inner=True)
         noun = qualified(noun, phrases)
-        moved = read_noun_phrase(Cursor(["the", "thing", *cursor.tokens[cursor.at :]])) if not cursor.at_end else None
-        if moved is not None and moved.moved:
-            noun, cursor.at = replace(noun, moved=moved.moved), len(cursor.tokens)
+        behind = Cursor(["the", "thing", *cursor.tokens[cursor.at :]])
+        more = read_noun_phrase(behind)
+        if more is not None and behind.at_end and not more.ranking and not more.relation:
+            noun = replace(noun, moved=(*noun.moved, *more.moved), excluded=(*noun.excluded, *more.excluded))
+            cursor.at = len(cursor.tokens)
     if noun is None or not cursor.at_end:
         raise NotUnderstood(f"{text!r} cannot be parsed as a description of an object")
     return noun
@@ -120,9 +122,9 @@ class _Reader:
         if not verb:
             raise NotUnderstood(f"no known verb at the beginning of {clause.said!r}")
         if verb == "avoid":
-            self._avoid += [Avoidance(thing=noun, cm=clause.cm) for noun in self._described(clause.groups)]
+            self._avoid += [Avoidance(thing=noun, cm=clause.cm) for noun in self._moved_described(clause.groups)]
         elif verb == "untouched":
-            self._untouched += self._described(clause.groups)
+            self._untouched += self._moved_described(clause.groups)
         elif verb.startswith("keep_"):
             self._kept += [(verb.removeprefix("keep_"), noun) for noun in self._described(clause.groups)]
         elif verb in {"put", "stack", "push"}:
@@ -148,6 +150,14 @@ class _Reader:
             found.append(noun)
         return found
 
+    def _moved_described(self, groups: Sequence[Group]) -> list[Noun]:
+        """The same, where "it" is the object moved last rather than its place."""
+        fixture = self._fixture
+        self._fixture = [*([fixture] if fixture else []), *self._moved, *self._picked][-1:][0] if fixture or self._moved or self._picked else None
+        found = self._described(groups)
+        self._fixture = fixture
+        return found
+
     def _forbid(self, clause: Clause) -> None:
         """What must not be done; it is read by a reader of its own, which knows what this one knows."""
         other = _Reader(self._names)
@@ -155,7 +165,7 @@ class _Reader:
         other._mentions, other._last = list(self._mentions), self._last
         clause.forbidden = False
         if clause.verb == "put" and not any(phrases for _, phrases in clause.groups):
-            self._untouched += self._described(clause.groups)
+            self._untouched += self._moved_described(clause.groups)
             return
         other._clause(clause)
         other._leave_picked(0.0)
@@ -239,6 +249,8 @@ class _Reader:
         """The objects that a description refers to, resolved."""
 
         def one(ref: Noun) -> Noun:
+            if ref.words[-1] in {"one", "ones"} and not ref.is_pronoun:
+                ref = self._headed(ref, [noun, *self._mentions[::-1]])
             if not ref.is_pronoun:
                 return self._resolved(ref, it)
             return it if it is not None else self._antecedent(ref)
@@ -270,7 +282,7 @@ class _Reader:
 
     def _fits(self, noun: Noun) -> bool:
         try:
-            ground(replace(noun, other=False), self._names)
+            ground(replace(noun, other=False, plural=True, number=None) if noun.other else noun, self._names)
         except NotUnderstood:
             return False
         return True
@@ -366,12 +378,12 @@ class _Reader:
         if phrase.kind not in PLACES or phrase.negated:
             raise NotUnderstood(f"'{phrase.said or phrase.kind}' is not a destination")
         second = self._resolved(phrase.second, thing) if phrase.second else None
-        target = self._place_thing(phrase, thing, placed)
+        target = self._place_thing(phrase, thing, placed, clause)
         self._mention(target)
         self._places.append(target)
         return Place(relation=phrase.kind, thing=target, second=second, cm=phrase.cm)
 
-    def _place_thing(self, phrase: Phrase, thing: Noun, placed: list[Action]) -> Noun:
+    def _place_thing(self, phrase: Phrase, thing: Noun, placed: list[Action], clause: Clause) -> Noun:
         """The object of a destination; "it" is what describes the object, or the last place or fixture."""
         noun = phrase.thing
         if noun is not None and not noun.is_pronoun:
@@ -381,12 +393,18 @@ class _Reader:
         if noun is None or noun.words[0] in {"it", "that", "this"}:
             if noun is not None and len(inner := _inner(thing)) > 1:
                 return inner[-2]
-            before = placed[-1].place if placed else None
+            before = placed[-1].place if placed else self._last[1] if clause.verb == "again" else None
+            flat = {"on", "top_of"}
+            if before is not None and noun is not None and before.relation in flat and phrase.kind in flat:
+                raise NotUnderstood(f"'{phrase.said} {noun.words[0]}' could be {self._moved_last(placed)} or {before.thing}")
             if before is not None:
                 return before.thing
             if self._fixture is None and self._mentions[:-1] and noun is not None:
                 return self._mentions[-2]
         return self._thing(noun if noun is not None else None)
+
+    def _moved_last(self, placed: Sequence[Action]) -> Noun:
+        return placed[-1].thing if placed else self._moved[-1]
 
     def _check_ruled_out(self, clause: Clause, placed: list[Action]) -> None:
         """ ", not on the right plate": it must be another place than the one that is said."""

@@ -90,7 +90,7 @@ def _without_excluded(found: Found, names: Sequence[Name]) -> Found:
     for excluded in found.noun.excluded:
         bare = excluded.words[-1] in {"one", "ones"} or (len(excluded.words) == 1 and excluded.words[0] in COLOURS)
         head = [word for word in excluded.words if word not in {"one", "ones"}] + ([found.noun.words[-1]] if bare else [])
-        noun = replace(excluded, words=tuple(head), plural=True, number=None)
+        noun = replace(excluded, words=tuple(head), plural=not excluded.indefinite, number=None)
         try:
             out = ground(noun, names)
         except NotUnderstood:
@@ -98,7 +98,8 @@ def _without_excluded(found: Found, names: Sequence[Name]) -> Found:
                 raise
             continue
         if out.is_settled or not (out.noun.ranking or out.noun.relation):
-            left = tuple(name for name in left if name not in out.names)
+            gone = out.names[:1] if excluded.indefinite else out.names
+            left = tuple(name for name in left if name not in gone)
         else:
             dynamic.append(replace(out.noun, plural=False))
     if not left:
@@ -109,10 +110,13 @@ def _without_excluded(found: Found, names: Sequence[Name]) -> Found:
 def _levelled(found: Found) -> Found:
     """Drawers and levels are told apart by their names: "the second drawer from the top"."""
     ranking, names = found.noun.ranking, found.names
-    if ranking is None or ranking.key not in {"top", "bottom"} or not all(name.is_part for name in names):
-        return found
     levels = [[_LEVELS[word] for word in name.part_words if word in _LEVELS] for name in names]
-    if not all(levels) or len({name.whole for name in names}) > 1:
+    if ranking is None or len(names) == 1 or not all(levels) or len({name.whole for name in names}) > 1:
+        return found
+    if ranking.key in {"left", "right", "front", "back"}:
+        listed = ", ".join(name.text for name in names)
+        raise NotUnderstood(f"{str(found.noun)!r}: {listed} are above one another")
+    if ranking.key not in {"top", "bottom"}:
         return found
     ordered = [name for _, name in sorted(zip([level[0] for level in levels], names, strict=True), key=lambda pair: pair[0])]
     ordered = ordered if ranking.key == "top" else ordered[::-1]
@@ -150,6 +154,8 @@ def holder(relation: str, name: Name, names: Sequence[Name]) -> Name | None:
     Raises:
         NotUnderstood: it goes into one of several drawers and none is named, or there is nothing below it.
     """
+    if name.is_part and {"handle", "knob", "door"} & set(name.part_words):
+        raise NotUnderstood(f"nothing can be put on or in {name.text}")
     if name.is_part:
         return _part_of(name.whole, names, ({"top"},)) if relation == "top_of" and "drawer" in name.words else None
     inside = ({"inside"},) if _part_of(name.text, names, ({"handle"}, {"door"})) else ()

@@ -97,7 +97,7 @@ FILLERS = frozenset(
     for phrase in """please|kindly|thank you|thanks|for me|again|instead|too|as well|right now|now|right away
     immediately|at once|one after the other|one after another|one by one|one at a time|together|neatly|properly|directly
     if you can|if possible|if you please|will you|would you|could you|can you|this time|completely|fully|all the way
-    afterwards|just|simply|straight|right there|safely|of course|on your own|at the end""".replace("\n", "|").split("|")
+    afterwards|just|simply|straight|right there|safely|of course|on your own|at the end|while doing so|while doing this|while doing that|in the process|meanwhile|if you would|if you could|carefully now""".replace("\n", "|").split("|")
 )
 # Between clauses; all mean that what follows is done next.
 THEN = frozenset(

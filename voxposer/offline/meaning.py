@@ -108,6 +108,8 @@ class Noun:
         elif ranking and ranking.ref is not None:
             before = _ordinal(ranking.rank)
             after = f" {'nearest to' if ranking.key == 'near' else 'farthest from'} {ranking.ref}"
+        elif ranking and not ranking.key:
+            before = _ordinal(ranking.rank) or "first "
         elif ranking:
             before = f"{_ordinal(ranking.rank)}{_SIZES.get(ranking.key, ranking.key)} "
         article = self._article()

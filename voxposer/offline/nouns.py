@@ -25,6 +25,7 @@ from voxposer.offline.lexicon import (
     SIDE_WORDS,
     STATES,
     UNITS,
+    VERBS,
 )
 from voxposer.offline.meaning import Noun, Ranking, Relation
 from voxposer.offline.names import COLOURS, NotUnderstood, singular
@@ -39,8 +40,8 @@ _STOPS = (
     | (PARTICLES - {"back"})
     | frozenset(
         """and or but then not that which who whose except excluding without before after once while when as is are was
-        were be been goes go belongs belong of , . ( ) where than so if until unless nor neither besides apart other
-        again at you we i has have had need needs there here halfway midway somewhere immediately""".split()
+        were be been goes go belongs belong of , . ( ) where than so if until unless nor neither besides apart other others
+        again at you we i has have had need needs there here ends sits stands lies forward forwards backward backwards halfway midway somewhere immediately""".split()
     )
 )
 _RELATIVES = ("that", "which", "who")
@@ -73,19 +74,20 @@ class Phrase:
     said: str = ""
 
 
-def read_noun_phrase(cursor: Cursor, *, inner: bool = False) -> Noun | None:
+def read_noun_phrase(cursor: Cursor, *, inner: bool = False, described: bool = False) -> Noun | None:
     """A noun phrase without the prepositional phrases behind it; None if there is none here.
 
     Args:
         cursor: where to read.
         inner: inside another noun phrase, to which "besides" belongs.
+        described: behind a preposition; an exception is then one of the object before it, unless this is a plural.
     """
     start = cursor.at
     noun = _head(cursor)
     if noun is None:
         cursor.at = start
         return None
-    return _with_modifiers(cursor, noun, inner)
+    return _with_modifiers(cursor, noun, inner, described or inner)
 
 
 def read_phrases(cursor: Cursor, *, inner: bool = False) -> list[Phrase]:
@@ -104,9 +106,11 @@ def read_phrase(cursor: Cursor, *, inner: bool = False) -> Phrase | None:
     cursor.take("away", "further", "farther")
     if cm is not None:
         cursor.take("and")
-    cursor.take("halfway", "midway", "half way", "exactly", "somewhere", "right", "immediately") if cm is None else None
     said = cursor.rest
     kind = cursor.take_meaning(PREPOSITIONS)
+    if kind is None and cursor.take("halfway", "midway", "half way", "exactly", "somewhere", "right", "immediately"):
+        said = cursor.rest
+        kind = cursor.take_meaning(PREPOSITIONS)
     if kind is None or (cm is not None and kind not in PLACES | {"from"}) or _ends_bare(cursor, kind):
         cursor.at = start
         return None
@@ -115,10 +119,10 @@ def read_phrase(cursor: Cursor, *, inner: bool = False) -> Phrase | None:
         return Phrase(kind=f"{side}_of", cm=cm, negated=negated, said=f"{words} the {side}")
     if cm is not None and kind == "from":
         kind = "near"
-    thing = read_noun_phrase(cursor, inner=inner)
+    thing = read_noun_phrase(cursor, inner=inner, described=True)
     second = None
     if kind == "between":
-        second = read_noun_phrase(cursor, inner=inner) if cursor.take("and") else None
+        second = read_noun_phrase(cursor, inner=inner, described=True) if cursor.take("and") else None
         if second is None and not (thing and (thing.plural or thing.words == ("them",))):
             raise NotUnderstood("'between' needs two objects")
     if kind == "center" and thing is not None and thing.words[-1] == "workspace":
@@ -228,8 +232,9 @@ def _determiner(cursor: Cursor) -> _Determiner:
             found.number = NUMBERS[token] if token in NUMBERS else int(token)
             found.exact |= found.definite or found.plural
             cursor.next()
-        elif token in {"other", "remaining"}:
+        elif token in {"other", "remaining", "others"}:
             found.other = True
+            found.plural |= token == "others"
             cursor.next()
         elif not _take_order(cursor, found):
             return found
@@ -351,16 +356,21 @@ def _words(cursor: Cursor) -> tuple[list[str], list[str]]:
             return words, excluded
         elif words and token in {"can", "will", "may", "might", "could"} and cursor.peek(1) in {"be", "go", "not"}:
             return words, excluded
-        elif words and token in GERUNDS:
+        elif words and (token in GERUNDS or _is_verb(cursor)):
             return words, excluded
         else:
             words.append(cursor.next())
 
 
+def _is_verb(cursor: Cursor) -> bool:
+    """Whether the next word is a verb with its object, where a comma was left out."""
+    return cursor.peek() in VERBS and cursor.peek(1) in ARTICLES | INDEFINITE | ALL | {"it", "them", "both"}
+
+
 # -- what stands behind the noun ---------------------------------------------------------------------------------------
 
 
-def _with_modifiers(cursor: Cursor, noun: Noun, inner: bool) -> Noun:
+def _with_modifiers(cursor: Cursor, noun: Noun, inner: bool, described: bool) -> Noun:
     """A noun with what describes it behind it, prepositional phrases aside."""
     while True:
         start = cursor.at
@@ -369,7 +379,7 @@ def _with_modifiers(cursor: Cursor, noun: Noun, inner: bool) -> Noun:
             or _ranked_from(cursor, noun)
             or _side(cursor, noun)
             or _distance(cursor, noun)
-            or _exclusion(cursor, noun)
+            or _exclusion(cursor, noun, described)
             or (None if inner else _moved(cursor, noun))
         )
         if changed is None:
@@ -478,30 +488,46 @@ def _distance(cursor: Cursor, noun: Noun) -> Noun | None:
     side_at = cursor.at
     cursor.take("to the", "on the", "at the", "towards the", "in the")
     side = SIDE_WORDS.get(cursor.peek())
-    if word and side and cursor.peek(1) != "of":
+    if word and side:
         cursor.next()
         cursor.take("side")
-        return replace(noun, ranking=Ranking(key=side, rank=rank))
+        if is_side_end(cursor):
+            return replace(noun, ranking=Ranking(key=side, rank=rank))
     cursor.at = side_at
-    ref = read_noun_phrase(cursor, inner=True) if cursor.take("to", "from") else None
+    linked = cursor.take("to", "from") or (word and cursor.peek() in ARTICLES)
+    ref = read_noun_phrase(cursor, inner=True) if linked else None
     if ref is None:
         cursor.at = start
         return None
     return replace(noun, ranking=Ranking(key=key, rank=rank, ref=ref))
 
 
-def _exclusion(cursor: Cursor, noun: Noun) -> Noun | None:
+def _exclusion(cursor: Cursor, noun: Noun, described: bool) -> Noun | None:
     """ "except the red one", "all but the left one", "not red", "without yellow"."""
     start = cursor.at
     cursor.take(",")
     many = noun.plural or noun.indefinite
     for phrase in EXCEPTIONS:
-        if cursor.sees(phrase) and (phrase != "but" or many) and not (phrase == "besides" and _sees_moved(cursor)):
+        if cursor.sees(phrase) and (many or not (described or phrase == "but")) and not (phrase == "besides" and _sees_moved(cursor)):
             cursor.take(phrase)
-            return _excluding(cursor, noun)
+            return _all_excluded(cursor, _excluding(cursor, noun))
     if cursor.take("without", "not") and cursor.peek() in COLOURS:
         return _excluding(cursor, noun)
     cursor.at = start
+    return None
+
+
+def _all_excluded(cursor: Cursor, noun: Noun | None) -> Noun | None:
+    """ "except the front one and the back one": further exclusions of the same kind."""
+    while noun is not None:
+        start = cursor.at
+        cursor.take(",")
+        cursor.take("and", "or")
+        more = read_noun_phrase(cursor, inner=True) if cursor.at > start and cursor.peek() in ARTICLES else None
+        if more is None or more.words[-1] not in {"one", noun.words[-1]}:
+            cursor.at = start
+            return noun
+        noun = replace(noun, excluded=(*noun.excluded, more))
     return None
 
 

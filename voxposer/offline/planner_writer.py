@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from voxposer.offline.grammar import understand
+from voxposer.offline.grammar import read_noun, understand
 from voxposer.offline.grounding import Found, ground, holder, is_fixture, is_table
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
+from voxposer.offline.query_writer import write_query
 from voxposer.offline.references import Moves
 
 # Distances named in subtasks, centimetres: over a target before the last descent; before a target that is entered
@@ -47,6 +48,8 @@ def write_planner(instruction: str, objects: Sequence[str]) -> str:
     meant = understand(instruction, objects)
     blocks = _Planner(names).plan(meant)
     extras = _extras(meant, names)
+    for phrase in {block.thing for block in blocks if block.thing}:
+        write_query(phrase, objects)
     said = [Block(tuple(_with(sentence, extras) for sentence in block.sentences), block.thing) for block in blocks]
     return "\n".join([*_program(said), "# done"])
 
@@ -151,9 +154,12 @@ class _Planner:
         """Refuse orders that contradict each other."""
         acted = {self._key(action.thing) for action in actions}
         for noun in (*meant.untouched, *(avoidance.thing for avoidance in meant.avoid)):
-            both = acted & self._key_parts(noun)
-            if both:
+            if acted & self._key_parts(noun):
                 raise NotUnderstood(f"{str(noun)!r} is to be left alone, and to be acted on")
+        places = {self._key(action.place.thing) for action in actions if action.place is not None}
+        for avoidance in meant.avoid:
+            if places & self._key_parts(avoidance.thing):
+                raise NotUnderstood(f"{str(avoidance.thing)!r} is to be kept away from, and to be put something at")
         for action in meant.forbidden:
             if any(self._is_same(action, other) for other in actions):
                 raise NotUnderstood(f"{action.verb.replace('_', ' ')} {action.thing} is asked for, and ruled out with 'not'")
@@ -163,9 +169,24 @@ class _Planner:
             if last and last[-1] != wanted:
                 raise NotUnderstood(f"{last[-1].replace('_', ' ')} {noun}, and keep it {state}: both cannot be")
         self._check_stacks(actions)
+        self._check_repeats(actions)
+
+    def _check_repeats(self, actions: Sequence[Action]) -> None:
+        """Refuse to put an object where it was put before, without anything between that moves it."""
+        at: dict[str, tuple[str, str]] = {}
+        for action in actions:
+            if action.verb not in {"put", "shift"}:
+                continue
+            place = (action.place.relation, self._key(action.place.thing)) if action.place else ("", "")
+            keys, could_be = self._key_parts(action.thing), ground(action.thing, self._names).names
+            again = any(at.get(key) == place for key in keys) or all(at.get(f"the {n.text}") == place for n in could_be)
+            if action.place and again:
+                raise NotUnderstood(f"{action.thing} is to be put {place[0].replace('_', ' ')} {place[1]} twice")
+            at |= dict.fromkeys(keys, place)
 
     def _check_stacks(self, actions: Sequence[Action]) -> None:
         below: dict[str, str] = {}
+        beside: dict[str, str] = {}
         for action in actions:
             if action.verb not in {"put", "push"} or action.place is None or is_table(action.place.thing):
                 continue
@@ -173,7 +194,10 @@ class _Planner:
             if thing == place:
                 raise NotUnderstood(f"{action.thing} cannot be put on, in or next to itself")
             if action.place.relation in BESIDE or action.place.relation in {"between", "towards"}:
+                if beside.get(place) == thing:
+                    raise NotUnderstood(f"{action.thing} and {action.place.thing} are each to be put where the other one is")
                 below.pop(thing, None)
+                beside[thing] = place
                 continue
             if below.get(place) == thing:
                 raise NotUnderstood(f"{action.thing} is to be on {action.place.thing}, which is to be on {action.thing}")
@@ -332,9 +356,9 @@ class _Planner:
 
     def _is_door(self, handle: str) -> bool:
         """A handle that belongs to no drawer."""
-        named = next(name for name in self._names if f"the {name.text}" == handle)
+        found = ground(read_noun(handle), self._names)
         drawers = {name.whole for name in self._names if "drawer" in name.words}
-        return named.whole not in drawers and not {"drawer", "cabinet"} & set(named.words)
+        return not any(name.whole in drawers or {"drawer", "cabinet"} & set(name.words) for name in found.names)
 
     def _turn(self, action: Action) -> list[Block]:
         switch = action.verb.removeprefix("turn_")

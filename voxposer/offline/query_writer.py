@@ -62,6 +62,7 @@ class _Locator:
 
     def __init__(self, names: Sequence[Name]) -> None:
         self._names = names
+        self._scaled = False
         self._used: set[str] = {"cm", "distances", "face", "objects", "np", "i", "foot", "gap", "high", "low", "middle", "thing"}
 
     def locate(self, noun: Noun, inside: str = "") -> tuple[list[str], str]:
@@ -90,6 +91,11 @@ class _Locator:
         name = next(name for name in (wish, *(f"{wish}_{i}" for i in range(2, 99))) if name not in self._used)
         self._used.add(name)
         return name
+
+    def _scale(self) -> list[str]:
+        """The line that says how large voxels are, the first time it is needed."""
+        needed, self._scaled = not self._scaled, True
+        return [_SCALE] if needed else []
 
     def _choose(self, found: Found, several: str) -> tuple[list[str], str]:
         noun = found.noun
@@ -120,24 +126,22 @@ class _Locator:
         if ranking.key == "middle":
             if ranking.rank != 1:
                 raise NotUnderstood("only one is in the middle")
-            lines = [_SCALE, f"middle = sum([thing.position for thing in {several}]) / len({several})"]
+            lines = [*self._scale(), f"middle = sum([thing.position for thing in {several}]) / len({several})"]
             return [*lines, _distances(several, "middle")], f"{several}[np.argmin(distances)]"
         if ranking.key in {"near", "far"}:
             assert ranking.ref is not None
             lines, goal = self._goal(Relation(kind="near", refs=(ranking.ref,)))
-            lines += [_SCALE, _distances(several, goal, flat=True)]
+            lines += [*self._scale(), _distances(several, goal, flat=True)]
             return lines, f"{several}[{_at('distances', ranking.key == 'near', ranking.rank)}]"
         least, value = _VALUES[ranking.key]
         values = f"[{value} for thing in {several}]"
-        return ([_SCALE] if "cm" in value else []), f"{several}[{_at(values, least, ranking.rank)}]"
+        return (self._scale() if "cm" in value else []), f"{several}[{_at(values, least, ranking.rank)}]"
 
     def _without_moved(self, count: int, relation: Relation, several: str) -> list[str]:
         """Lines that leave out those that are where others were put."""
         lines, goal = self._goal(relation)
-        if _is_on(relation):
-            lines += [_SCALE, *_gaps(several, goal.removesuffix(".position"))]
-        else:
-            lines += [_SCALE, _distances(several, goal, flat=relation.kind != "in")]
+        flat = relation.kind not in {"on", "in", "top_of", "under"}
+        lines += [*self._scale(), _distances(several, goal, flat=flat)]
         return [*lines, f"{several} = [{several}[i] for i in np.argsort(distances)[{count}:]]"]
 
     def _without(self, excluded: Noun, several: str) -> list[str]:
@@ -153,9 +157,9 @@ class _Locator:
         lines, goal = self._goal(relation)
         away = relation.negated != (relation.kind == "outside")
         if _is_on(relation):
-            lines += [_SCALE, *_gaps(several, goal.removesuffix(".position"))]
+            lines += [*self._scale(), *_gaps(several, goal.removesuffix(".position"))]
         else:
-            lines += [_SCALE, _distances(several, goal, flat=relation.kind in _FLAT)]
+            lines += [*self._scale(), _distances(several, goal, flat=relation.kind in _FLAT)]
         return lines, f"{several}[np.{'argmax' if away else 'argmin'}(distances)]"
 
     def _goal(self, relation: Relation) -> tuple[list[str], str]:
@@ -177,8 +181,8 @@ class _Locator:
         """The closest one on one side of an object."""
         lines, goal = self._goal(relation)
         lines, candidates = self._filtered(relation, several, lines, goal)
-        lines += [_SCALE, _distances(candidates, goal)]
-        return lines, f"{candidates}[np.argmin(distances)]"
+        lines += [*self._scale(), _distances(candidates, goal)]
+        return lines, f"{candidates}[np.argmin(distances)] if len({candidates}) > 0 else None"
 
     def _beyond(self, relation: Relation, several: str) -> tuple[list[str], str]:
         """Those on one side of an object."""

@@ -30,11 +30,14 @@ class Moves:
 
     def __init__(self, names: Sequence[Name]) -> None:
         self._names = names
-        self._moved: list[tuple[Found, Place]] = []
+        self._moved: list[tuple[Found, Place, int]] = []
 
     def add(self, found: Found, place: Place) -> None:
         """Note that an object was put somewhere."""
-        self._moved.append((found, place))
+        several = found.noun.plural and not found.is_settled
+        named = several and not (found.noun.ranking or found.noun.relation or found.noun.excluded)
+        if not named:
+            self._moved.append((found, place, (found.noun.number or 1) if several else 1))
 
     def count(self, noun: Noun, place: Place) -> int:
         """How many objects a description means."""
@@ -60,9 +63,7 @@ class Moves:
         if dynamic and not chosen.ranking and not chosen.relation:
             chosen, number = self._opposite(found, dynamic), len(found.names) - len(dynamic)
         if number is None:
-            if chosen.ranking is None:
-                raise NotUnderstood(f"how many are {str(noun)!r}? Say a number")
-            number = 1
+            raise NotUnderstood(f"how many are {str(noun)!r}? Say a number")
         chosen = replace(chosen, plural=False, number=None, exact=False, indefinite=False)
         if place is None:
             return [str(chosen)] * min(number, 2)
@@ -105,27 +106,43 @@ class Moves:
 
     def since_moved(self, found: Found) -> Found:
         """The object described so that the description holds now, after what was moved."""
-        for moved, place in self._moved:
-            if found.is_settled or moved.is_settled or moved.names != found.names or moved.noun.plural:
+        for moved, place, count in self._moved:
+            if found.is_settled or moved.is_settled or moved.names != found.names:
                 continue
             if _bare(moved.noun) == _bare(found.noun):
+                if not is_table(place.thing) and ground(place.thing, self._names).names == found.names:
+                    return self._stacked(found, place, "top")
                 relation = self._relation(place)
                 return replace(found, noun=replace(_plain(found.noun), relation=relation))
-            found = self._among_others(found, moved, place)
+            found = self._among_others(found, moved, place, count)
         return found
 
-    def _among_others(self, found: Found, moved: Found, place: Place) -> Found:
-        """Another object than one that was moved."""
+    def _among_others(self, found: Found, moved: Found, place: Place, count: int) -> Found:
+        """Another object than those that were moved."""
         noun, there = found.noun, self._relation(place)
+        if self._is(place.thing, found):
+            return self._stacked(found, place, "bottom")
         excluded = tuple(out for out in noun.excluded if _bare(out) != _bare(moved.noun))
-        gone = (*noun.moved, (1, there))
-        if len(found.names) - len(gone) == 1:
+        gone = (*noun.moved, (count, there))
+        if len(found.names) - sum(number for number, _ in gone) == 1:
             noun = replace(_plain(noun), moved=gone)
-            if len(gone) == 1 and place.relation not in BESIDE | {"between", "center"}:
+            if gone == ((1, there),) and place.relation not in BESIDE | {"between", "center"}:
                 noun = replace(noun, moved=(), relation=Relation(kind="outside", refs=(place.thing,)))
             return replace(found, noun=noun)
-        ranking = _among_rest(noun.ranking, moved.noun.ranking, len(found.names))
+        ranking = noun.ranking
+        for _ in range(count):
+            ranking = _among_rest(ranking, moved.noun.ranking, len(found.names))
         return replace(found, noun=replace(noun, excluded=excluded, ranking=ranking, moved=gone))
+
+    def _is(self, noun: Noun, found: Found) -> bool:
+        """Whether two descriptions are the same."""
+        return not is_table(noun) and _bare(ground(noun, self._names).noun) == _bare(found.noun)
+
+    def _stacked(self, found: Found, place: Place, key: str) -> Found:
+        """The upper or lower one of two equal objects that were stacked."""
+        if len(found.names) != 2 or place.relation not in {"on", "in", "top_of"}:
+            raise NotUnderstood(f"once two of them are together, {str(found.noun)!r} cannot be told any more")
+        return replace(found, noun=replace(_plain(found.noun), ranking=Ranking(key=key)))
 
     def _relation(self, place: Place) -> Relation:
         """Where an object is that was put at a place."""
@@ -151,6 +168,8 @@ def _among_rest(ranking: Ranking | None, gone: Ranking | None, count: int) -> Ra
     if ranking.key == "middle" and count == 3 and gone.key in {"left", "right", "front", "back"}:
         # Of three in a row with one end gone, the middle one is at that end.
         return replace(gone, rank=1)
+    if gone.key == "middle" and abs(ranking.rank) == 1 and ranking.key != "middle":
+        return ranking
     if ranking.key == "middle" or gone.key == "middle":
         raise NotUnderstood(f"once one of {count} is moved, which is in the middle cannot be told any more")
     if _OPPOSITE.get(ranking.key) == gone.key and ranking.rank > 0 and gone.rank > 0 and ranking.rank > count - gone.rank + 1:

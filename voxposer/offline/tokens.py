@@ -18,11 +18,14 @@ T = TypeVar("T")
 _TOKEN = re.compile(r"\d+(?:[.,]\d+)?(?![\w_])|[^\W_]+(?:_\w+)+|[^\W\d_]+(?:'[^\W\d_]+)*|\w+|[^\w\s]")
 _ENDS = frozenset(".;:!?\n")
 _SPELLINGS = (
+    (r"(?:^|(?<=[\s.;:,!?]))(?:step\s+)?\d+\s?[.):](?=\s|$)", " . "),
+    (r"[()]", ","),
     (r"[\u2018\u2019\u02bc`\u00b4]", "'"),
     (r"[\u2010-\u2015\u2212]", "-"),
     (rf"(?<![\w.])(\d+(?:\.\d+)?)({'|'.join(sorted(UNITS, key=len, reverse=True))})\b", r"\1 \2"),
     (r'(\d)\s*(?:"|\u201d|\u2033)(?=\W|$)', r"\1 inch"),
     (r"\b(left|right|front|back|top|bottom|upper|lower|rear|middle)[- ]most\b", r"\1most"),
+    (r"\b(left|right)[- ]?hand\b", r"\1"),
     (r"(?<=\w)-(?=\w)", " "),
     (r"\b(that|which|it|there|who|what)'s\b", r"\1 is"),
     (r"\b(i|we|you)'d like\b", r"\1 would like"),
@@ -34,6 +37,7 @@ _SPELLINGS = (
     (r"(?<=\w)'s\b|(?<=s)'(?=\s)", " "),
     (r"\bfrying pan(s?)\b", r"frypan\1"),
     (r"\b(?:layer|level) of (?:the )?drawers?\b", "drawer"),
+    (r"\b(?:the )?table (?:center|centre|middle)\b", "the center of the table"),
     (r"&", " and "),
 )
 
