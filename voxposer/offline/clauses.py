@@ -218,6 +218,9 @@ class _Sentence:
         clause.when, clause.said = when, " ".join(cursor.tokens[start : cursor.at])
         self._clauses.append(clause)
         self._ruled_out(clause)
+        if len(self._clauses) > 1 and cursor.peek() == "first" and _at_clause_end(cursor, 1):
+            cursor.next()
+            clause.when = self._clauses[-2].when - 0.5
         return clause
 
     def _ruled_out(self, clause: Clause) -> None:

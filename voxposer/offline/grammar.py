@@ -12,8 +12,9 @@ from dataclasses import replace
 
 from voxposer.offline.clauses import Clause, Group, read_clauses
 from voxposer.offline.grounding import ground, is_table
+from voxposer.offline.lexicon import SIDE_WORDS, SIZES
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place, Ranking, Relation
-from voxposer.offline.names import Name, NotUnderstood, matching, read_names
+from voxposer.offline.names import COLOURS, Name, NotUnderstood, matching, read_names
 from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, read_phrase, read_phrases
 from voxposer.offline.tokens import Cursor, tokenize
 
@@ -271,14 +272,16 @@ class _Reader:
         """ "The red one": with the noun of an earlier object in place of "one", the latest that makes sense."""
         if noun.words[-1] not in {"one", "ones"}:
             return noun
-        heads = list(dict.fromkeys(mention.words[-1:] for mention in mentions if not is_table(mention)))
-        for head in heads:
+        own = set(noun.words[:-1])
+        heads = [_described_words(mention, own) for mention in mentions if not is_table(mention)]
+        heads += [mention.words[-1:] for mention in mentions if not is_table(mention)]
+        for head in dict.fromkeys(heads):
             option = replace(noun, words=(*noun.words[:-1], *head))
             if not self._names or self._fits(option):
                 return option
         if not heads:
             raise NotUnderstood(f"{str(noun)!r}: one of what?")
-        return replace(noun, words=(*noun.words[:-1], *heads[0]))
+        return replace(noun, words=(*noun.words[:-1], *heads[-1]))
 
     def _fits(self, noun: Noun) -> bool:
         try:
@@ -394,17 +397,19 @@ class _Reader:
             if noun is not None and len(inner := _inner(thing)) > 1:
                 return inner[-2]
             before = placed[-1].place if placed else self._last[1] if clause.verb == "again" else None
-            flat = {"on", "top_of"}
-            if before is not None and noun is not None and before.relation in flat and phrase.kind in flat:
-                raise NotUnderstood(f"'{phrase.said} {noun.words[0]}' could be {self._moved_last(placed)} or {before.thing}")
+            last = self._moved_last(placed)
+            bearing = {"on", "top_of", "in"} if last is not None and last.words[-1] in _BEARERS else set()
+            where = before.relation if before else self._last[1].relation if self._last[1] else ""
+            if noun is not None and where in bearing and phrase.kind in bearing - ({"top_of"} if where == "in" else set()):
+                raise NotUnderstood(f"'{phrase.said} {noun.words[0]}' could be {last} or what it is put on or in")
             if before is not None:
                 return before.thing
             if self._fixture is None and self._mentions[:-1] and noun is not None:
                 return self._mentions[-2]
         return self._thing(noun if noun is not None else None)
 
-    def _moved_last(self, placed: Sequence[Action]) -> Noun:
-        return placed[-1].thing if placed else self._moved[-1]
+    def _moved_last(self, placed: Sequence[Action]) -> Noun | None:
+        return placed[-1].thing if placed else self._moved[-1] if self._moved else None
 
     def _check_ruled_out(self, clause: Clause, placed: list[Action]) -> None:
         """ ", not on the right plate": it must be another place than the one that is said."""
@@ -436,6 +441,16 @@ class _Reader:
 
 
 _VERBS = frozenset("put stack push pick open close turn_on turn_off".split())
+
+
+# Things that others can stand in or on.
+_BEARERS = frozenset("plate bowl tray basket towel cloth book block cube box ramekin mug cup pan frypan caddy cookie".split())
+
+
+def _described_words(noun: Noun, own: set[str]) -> tuple[str, ...]:
+    """What "one" repeats of an earlier description: all but its side and size, and its colour where another is said."""
+    dropped = {*SIDE_WORDS, *SIZES, *(COLOURS if own & COLOURS else ())}
+    return tuple(word for word in noun.words if word not in dropped) or noun.words[-1:]
 
 
 def _carrying(stack: Action) -> list[list[Noun]]:

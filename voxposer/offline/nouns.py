@@ -356,6 +356,8 @@ def _words(cursor: Cursor) -> tuple[list[str], list[str]]:
             return words, excluded
         elif words and token in {"can", "will", "may", "might", "could"} and cursor.peek(1) in {"be", "go", "not"}:
             return words, excluded
+        elif words and token in ORDINALS and cursor.peek(1) in {"", ",", ".", "and", "then"}:
+            return words, excluded
         elif words and (token in GERUNDS or _is_verb(cursor)):
             return words, excluded
         else:

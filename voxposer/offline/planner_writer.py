@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from voxposer.offline.grammar import read_noun, understand
 from voxposer.offline.grounding import Found, ground, holder, is_fixture, is_table
+from voxposer.offline.lexicon import GENERIC
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 from voxposer.offline.query_writer import write_query
@@ -48,8 +49,6 @@ def write_planner(instruction: str, objects: Sequence[str]) -> str:
     meant = understand(instruction, objects)
     blocks = _Planner(names).plan(meant)
     extras = _extras(meant, names)
-    for phrase in {block.thing for block in blocks if block.thing}:
-        write_query(phrase, objects)
     said = [Block(tuple(_with(sentence, extras) for sentence in block.sentences), block.thing) for block in blocks]
     return "\n".join([*_program(said), "# done"])
 
@@ -109,6 +108,7 @@ class _Planner:
 
     def __init__(self, names: Sequence[Name]) -> None:
         self._names = names
+        self._objects = [name.text for name in names]
         self._moves = Moves(names)
         self._arrivals: dict[Place, int] = {}
         self._arrived: dict[Place, int] = {}
@@ -191,7 +191,7 @@ class _Planner:
             if action.verb not in {"put", "push"} or action.place is None or is_table(action.place.thing):
                 continue
             thing, place = self._key(action.thing), self._key(action.place.thing)
-            if thing == place:
+            if thing == place or self._is_among(action.place.thing, action.thing):
                 raise NotUnderstood(f"{action.thing} cannot be put on, in or next to itself")
             if action.place.relation in BESIDE or action.place.relation in {"between", "towards"}:
                 if beside.get(place) == thing:
@@ -202,6 +202,14 @@ class _Planner:
             if below.get(place) == thing:
                 raise NotUnderstood(f"{action.thing} is to be on {action.place.thing}, which is to be on {action.thing}")
             below[thing] = place
+
+    def _is_among(self, place: Noun, things: Noun) -> bool:
+        """Whether a place is one of the things that are to be put there."""
+        there, moved = ground(place, self._names), ground(things, self._names)
+        if moved.noun.words[-1] in GENERIC:
+            return False
+        several = moved.noun.plural and moved.noun.number in {None, len(moved.names)} and not moved.noun.relation
+        return several and set(there.names) <= set(moved.names) and not (moved.noun.excluded and not there.is_settled)
 
     def _key(self, noun: Noun) -> str:
         """The same text for the same object."""
@@ -226,6 +234,8 @@ class _Planner:
     def _things(self, noun: Noun, place: Place | None = None) -> list[str]:
         """Phrases for objects that are to be moved."""
         phrases = self._moves.phrases(noun, place)
+        for phrase in phrases:
+            write_query(phrase, self._objects)
         for name in ground(noun, self._names).names:
             if is_fixture(name, self._names):
                 raise NotUnderstood(f"{name.text} is fixed, or a part, and cannot be moved")
@@ -236,7 +246,7 @@ class _Planner:
         if is_table(place.thing):
             return "the table"
         found = _place_thing(place, self._names)
-        if place.relation in BESIDE:
+        if place.relation in BESIDE | {"to", "towards"}:
             return self._single(self._moves.since_moved(found))
         found = self._moves.since_moved(found)
         part = holder(_holding(place.relation), found.names[0], self._names) if found.is_settled else None
@@ -248,6 +258,8 @@ class _Planner:
         if found.noun.plural and not found.is_settled:
             listed = ", ".join(name.text for name in found.names)
             raise NotUnderstood(f"{str(found.noun)!r} are several places: {listed}; say which")
+        # What parse_query_obj would not understand is refused now, before anything moves.
+        write_query(found.text, self._objects)
         return found.text
 
     def _operated(self, noun: Noun, part: str) -> list[str]:

@@ -107,7 +107,10 @@ class Moves:
     def since_moved(self, found: Found) -> Found:
         """The object described so that the description holds now, after what was moved."""
         for moved, place, count in self._moved:
-            if found.is_settled or moved.is_settled or moved.names != found.names:
+            if found.is_settled or found.noun.plural or not set(moved.names[:1] if moved.is_settled else moved.names) & set(found.names):
+                continue
+            if moved.is_settled:
+                found = self._without_name(found, moved.names[0])
                 continue
             if _bare(moved.noun) == _bare(found.noun):
                 if not is_table(place.thing) and ground(place.thing, self._names).names == found.names:
@@ -116,6 +119,17 @@ class Moves:
                 return replace(found, noun=replace(_plain(found.noun), relation=relation))
             found = self._among_others(found, moved, place, count)
         return found
+
+    def _without_name(self, found: Found, gone: Name) -> Found:
+        """Another object than one that was moved and has a name of its own."""
+        noun = found.noun
+        if noun.ranking and (noun.ranking.key == "middle" or abs(noun.ranking.rank) != 1):
+            raise NotUnderstood(f"once {gone.text} is moved, {str(noun)!r} cannot be told any more")
+        left = tuple(name for name in found.names if name != gone)
+        if not left:
+            return found
+        excluded = (*noun.excluded, Noun(words=(gone.text,)))
+        return Found(replace(noun, excluded=excluded), left)
 
     def _among_others(self, found: Found, moved: Found, place: Place, count: int) -> Found:
         """Another object than those that were moved."""
@@ -130,7 +144,9 @@ class Moves:
                 noun = replace(noun, moved=(), relation=Relation(kind="outside", refs=(place.thing,)))
             return replace(found, noun=noun)
         ranking = noun.ranking
-        for _ in range(count):
+        if moved.names != found.names and ranking and (ranking.key == "middle" or abs(ranking.rank) != 1):
+            raise NotUnderstood(f"once {moved.noun} is moved, {str(noun)!r} cannot be told any more")
+        for _ in range(count if moved.names == found.names else 0):
             ranking = _among_rest(ranking, moved.noun.ranking, len(found.names))
         return replace(found, noun=replace(noun, excluded=excluded, ranking=ranking, moved=gone))
 
