@@ -3,9 +3,9 @@
     python benchmarks/voxposer_sentences.py                  # the table
     python benchmarks/voxposer_sentences.py --failures       # and the failures of the tuned half
 
-Each sentence is planned and carried out in a world without physics, and the relations at the end are compared with those
-in the file. Of the held-out half only counts are printed, so that the grammar can be tuned without it; ``--failures all``
-prints that half too.
+Each sentence is planned and carried out in a world without physics, and the relations at the end are compared with
+those in the file. Of the held-out half only counts are printed, so that the grammar can be tuned without it;
+``--failures all`` prints that half too.
 """
 
 from __future__ import annotations

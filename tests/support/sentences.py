@@ -1,8 +1,8 @@
 """The set of sentences in ``tests/data/voxposer_sentences.yaml``, and what the offline writer makes of each.
 
 A sentence is planned and carried out in ``offline_world``; the relations that hold afterwards are compared with those
-that the file expects. The file's head says what they mean. A fixed rule, the hash of the sentence, puts each sentence into
-the half that the grammar is tuned on or into the one that is only scored.
+that the file expects. The file's head says what they mean. A fixed rule, the hash of the sentence, puts each sentence
+into the half that the grammar is tuned on or into the one that is only scored.
 """
 
 from __future__ import annotations
@@ -67,14 +67,17 @@ class Verdict:
 def load() -> tuple[Sentence, ...]:
     """All sentences, in order."""
     listed = yaml.safe_load(FILE.read_text())["sentences"]
-    return tuple(Sentence(**{key: tuple(v) if isinstance(v, list) else v for key, v in one.items()}) for one in listed)
+    fields: list[dict[str, Any]] = [
+        {key: tuple(value) if isinstance(value, list) else value for key, value in one.items()} for one in listed
+    ]
+    return tuple(Sentence(**one) for one in fields)
 
 
 @functools.cache
 def snapshots() -> Mapping[str, ObjectsSnapshot]:
     """The scenes by name."""
     described = yaml.safe_load(FILE.read_text())["scenes"]
-    found = {name: _boxes(scene["boxes"]) for name, scene in described.items() if "boxes" in scene}
+    found: dict[str, Any] = {name: _boxes(scene["boxes"]) for name, scene in described.items() if "boxes" in scene}
     by_suite: dict[str, list[str]] = collections.defaultdict(list)
     for name, scene in described.items():
         if "suite" in scene:
@@ -89,9 +92,7 @@ def snapshots() -> Mapping[str, ObjectsSnapshot]:
 
 def _boxes(boxes: Mapping[str, Sequence[float]]) -> ObjectsSnapshot:
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    clouds = {
-        name: PointCloud(corners * row[3:] + np.array(row[:3]), np.zeros((8, 3))) for name, row in boxes.items()
-    }
+    clouds = {name: PointCloud(corners * row[3:] + np.array(row[:3]), np.zeros((8, 3))) for name, row in boxes.items()}
     return ObjectsSnapshot(
         names=tuple(clouds),
         objects=clouds,
@@ -134,7 +135,7 @@ def judge(sentence: Sentence) -> Verdict:
         world.do(sentence.say)
     except LmpError as error:
         return _judge_refusal(sentence, str(error), world)
-    except Exception as error:  # noqa: BLE001  (whatever it is, it is counted)
+    except Exception as error:  # whatever it is, it is counted
         return Verdict("crash", f"{type(error).__name__}: {error}")
     if sentence.refused:
         return Verdict("wrong", f"should be refused; did {world.log}")

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from voxposer.offline.clauses import Clause, Group, read_clauses
+from voxposer.offline.clause import Clause, Group
+from voxposer.offline.clauses import read_clauses
 from voxposer.offline.grounding import ground, is_table
-from voxposer.offline.lexicon import SIDE_WORDS, SIZES
+from voxposer.offline.lexicon import SIDE_WORDS, SIZES, words
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place, Ranking, Relation
 from voxposer.offline.names import COLOURS, Name, NotUnderstood, matching, read_names
 from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, read_phrase, read_phrases
@@ -154,7 +155,11 @@ class _Reader:
     def _moved_described(self, groups: Sequence[Group]) -> list[Noun]:
         """The same, where "it" is the object moved last rather than its place."""
         fixture = self._fixture
-        self._fixture = [*([fixture] if fixture else []), *self._moved, *self._picked][-1:][0] if fixture or self._moved or self._picked else None
+        self._fixture = (
+            [*([fixture] if fixture else []), *self._moved, *self._picked][-1:][0]
+            if fixture or self._moved or self._picked
+            else None
+        )
         found = self._described(groups)
         self._fixture = fixture
         return found
@@ -183,7 +188,9 @@ class _Reader:
         for index, noun in enumerate(things):
             out = [other for other in clause.ruled_out if isinstance(other, Noun)]
             if out:
-                things[index] = replace(noun, excluded=(*noun.excluded, *(self._headed(other, [noun]) for other in out)))
+                things[index] = replace(
+                    noun, excluded=(*noun.excluded, *(self._headed(other, [noun]) for other in out))
+                )
 
     # -- what is meant -------------------------------------------------------------------------------------------------
 
@@ -200,7 +207,9 @@ class _Reader:
         if word in {"itself", "themselves"}:
             raise NotUnderstood(f"{word!r}: nothing can be put on or in {word}")
         if self._fixture is None:
-            raise NotUnderstood(f"{word!r} refers to nothing said before" if noun else "the omitted object refers to nothing")
+            raise NotUnderstood(
+                f"{word!r} refers to nothing said before" if noun else "the omitted object refers to nothing"
+            )
         return self._fixture
 
     def _said(self, as_place: bool) -> list[Noun]:
@@ -400,7 +409,11 @@ class _Reader:
             last = self._moved_last(placed)
             bearing = {"on", "top_of", "in"} if last is not None and last.words[-1] in _BEARERS else set()
             where = before.relation if before else self._last[1].relation if self._last[1] else ""
-            if noun is not None and where in bearing and phrase.kind in bearing - ({"top_of"} if where == "in" else set()):
+            if (
+                noun is not None
+                and where in bearing
+                and phrase.kind in bearing - ({"top_of"} if where == "in" else set())
+            ):
                 raise NotUnderstood(f"'{phrase.said} {noun.words[0]}' could be {last} or what it is put on or in")
             if before is not None:
                 return before.thing
@@ -416,7 +429,10 @@ class _Reader:
         for out in clause.ruled_out:
             if isinstance(out, Phrase) and out.thing is not None and out.kind in PLACES:
                 noun = self._headed(out.thing, [action.place.thing for action in placed if action.place])
-                if any(action.place and action.place.thing == noun and out.kind == action.place.relation for action in placed):
+                if any(
+                    action.place and action.place.thing == noun and out.kind == action.place.relation
+                    for action in placed
+                ):
                     raise NotUnderstood(f"{clause.said!r} is ruled out by 'not {out.said} {noun}'")
             elif isinstance(out, Noun):
                 things = [action.thing for action in placed]
@@ -440,11 +456,13 @@ class _Reader:
         self._actions += [(when, action) for action in actions]
 
 
-_VERBS = frozenset("put stack push pick open close turn_on turn_off".split())
+_VERBS = frozenset(words("put stack push pick open close turn_on turn_off"))
 
 
 # Things that others can stand in or on.
-_BEARERS = frozenset("plate bowl tray basket towel cloth book block cube box ramekin mug cup pan frypan caddy cookie".split())
+_BEARERS = frozenset(
+    words("plate bowl tray basket towel cloth book block cube box ramekin mug cup pan frypan caddy cookie")
+)
 
 
 def _described_words(noun: Noun, own: set[str]) -> tuple[str, ...]:

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from voxposer.offline.lexicon import GENERIC, SIDE_WORDS, SIZES
+from voxposer.offline.lexicon import GENERIC, SIDE_WORDS, SIZES, words
 from voxposer.offline.meaning import Noun, Ranking
 from voxposer.offline.names import COLOURS, Name, NotUnderstood, matching
 
 TABLE = ("table",)
 _TABLES = frozenset(["table", "tabletop", "desk", "counter", "countertop", "workspace", "floor"])
 # A thing with such a part is a fixture.
-_FIXED_PARTS = frozenset("handle knob burner level slot door drawer top".split())
-_FIXTURES = frozenset("cabinet stove shelf microwave rack sink".split())
+_FIXED_PARTS = frozenset(words("handle knob burner level slot door drawer top"))
+_FIXTURES = frozenset(words("cabinet stove shelf microwave rack sink"))
 _LEVELS = {"top": 0, "upper": 0, "middle": 1, "bottom": 2, "lower": 2}
 
 
@@ -89,7 +89,9 @@ def _without_excluded(found: Found, names: Sequence[Name]) -> Found:
     left, dynamic = found.names, []
     for excluded in found.noun.excluded:
         bare = excluded.words[-1] in {"one", "ones"} or (len(excluded.words) == 1 and excluded.words[0] in COLOURS)
-        head = [word for word in excluded.words if word not in {"one", "ones"}] + ([found.noun.words[-1]] if bare else [])
+        head = [word for word in excluded.words if word not in {"one", "ones"}] + (
+            [found.noun.words[-1]] if bare else []
+        )
         noun = replace(excluded, words=tuple(head), plural=not excluded.indefinite, number=None)
         try:
             out = ground(noun, names)
@@ -118,7 +120,9 @@ def _levelled(found: Found) -> Found:
         raise NotUnderstood(f"{str(found.noun)!r}: {listed} are above one another")
     if ranking.key not in {"top", "bottom"}:
         return found
-    ordered = [name for _, name in sorted(zip([level[0] for level in levels], names, strict=True), key=lambda pair: pair[0])]
+    ordered = [
+        name for _, name in sorted(zip([level[0] for level in levels], names, strict=True), key=lambda pair: pair[0])
+    ]
     ordered = ordered if ranking.key == "top" else ordered[::-1]
     if abs(ranking.rank) > len(ordered):
         return found

@@ -89,7 +89,12 @@ def _between_for(match: Groups) -> list[str]:
 
 def _center_for(match: Groups) -> list[str]:
     """On the table in the middle of it, for the held object."""
-    return [get(match["thing"], "thing"), get("held object", "held"), "x, y, z = thing.position", *_hand_over(match["cm"])]
+    return [
+        get(match["thing"], "thing"),
+        get("held object", "held"),
+        "x, y, z = thing.position",
+        *_hand_over(match["cm"]),
+    ]
 
 
 def _hand_over(cm: str) -> list[str]:

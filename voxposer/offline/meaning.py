@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-PRONOUNS = frozenset(["each other", *"it them they one that this those these there itself themselves here".split()])
+from voxposer.offline.lexicon import words
+
+PRONOUNS = frozenset(["each other", *words("it them they one that this those these there itself themselves here")])
 BESIDE = frozenset(["near", "left_of", "right_of", "front_of", "back_of"])
 
 

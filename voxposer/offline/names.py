@@ -72,7 +72,7 @@ _SENSES = {
     "redbull": ("drink",),
 }
 _IRREGULAR = {"shelves": "shelf", "knives": "knife", "boxes": "box", "dishes": "dish", "glasses": "glass"}
-_NOT_PLURAL = _words("gas glass less plus lens alias")
+_NOT_PLURAL = _words("gas glass less plus lens alias themselves")
 
 
 class NotUnderstood(InvalidInput):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from voxposer.offline.determiners import LINKS, Determiner, is_word, read_determiner, read_length
 from voxposer.offline.lexicon import (
     ALL,
     ARTICLES,
@@ -15,42 +16,23 @@ from voxposer.offline.lexicon import (
     FARTHEST,
     GERUNDS,
     INDEFINITE,
-    MODALS,
     NEAREST,
-    NUMBERS,
     ORDERS,
     ORDINALS,
-    PARTICLES,
     PREPOSITIONS,
     SIDE_WORDS,
     STATES,
-    UNITS,
     VERBS,
+    words,
 )
 from voxposer.offline.meaning import Noun, Ranking, Relation
 from voxposer.offline.names import COLOURS, NotUnderstood, singular
 from voxposer.offline.tokens import Cursor, is_side_end
 
-# Words that end the words of a noun phrase.
-_STOPS = (
-    frozenset(phrase[0] for phrase in PREPOSITIONS if phrase[0] not in SIDE_WORDS)
-    | frozenset(phrase[0] for phrase in MODALS if phrase[0] not in {"can", "will", "may", "might"})
-    | NEAREST
-    | FARTHEST
-    | (PARTICLES - {"back"})
-    | frozenset(
-        """and or but then not that which who whose except excluding without before after once while when as is are was
-        were be been goes go belongs belong of , . ( ) where than so if until unless nor neither besides apart other others
-        again at you we i has have had need needs there here ends sits stands lies forward forwards backward backwards halfway midway somewhere immediately""".split()
-    )
-)
 _RELATIVES = ("that", "which", "who")
-_LINKS = ("is", "are", "was", "were", "lies", "lie", "sits", "sit", "stands", "stand", "lay", "stood", "rests")
 _PARTITIVES = frozenset(["piece", "stick", "pat", "slice", "bit", "unit", "item", "kind"])
 _MODIFIERS = frozenset(["from", "outside", "center", "between"])
-PLACES = frozenset(
-    "on in top_of under near left_of right_of front_of back_of between center to towards".split()
-)
+PLACES = frozenset(words("on in top_of under near left_of right_of front_of back_of between center to towards"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,120 +129,7 @@ def _ends_bare(cursor: Cursor, kind: str) -> bool:
     return kind in {"to", "from", "towards"} and cursor.at_end
 
 
-def read_length(cursor: Cursor) -> float | None:
-    """A length in centimetres: "10 cm", "two inches", "half a foot", "a little"; None if there is none here."""
-    start = cursor.at
-    cursor.take("about", "around", "roughly", "approximately", "exactly", "by", "at least", "some", "for")
-    cursor.take("about", "around", "roughly", "approximately", "exactly", "at least")
-    if cursor.take("a little bit", "a little", "a bit", "slightly", "a tad") and not _is_word(cursor.peek()):
-        return 5.0
-    half = cursor.take("half a", "half an")
-    token = cursor.next()
-    number = 0.5 if half else _number(token)
-    if half:
-        cursor.at -= 1
-    elif number is not None and cursor.take("and a half"):
-        number += 0.5
-    unit = UNITS.get(cursor.peek())
-    if number is None or unit is None:
-        cursor.at = start
-        return None
-    cursor.next()
-    if cursor.take("and a half"):
-        number += 0.5
-    return number * unit
-
-
-def _number(token: str) -> float | None:
-    if token in {"a", "an"}:
-        return 1.0
-    if token in NUMBERS:
-        return float(NUMBERS[token])
-    try:
-        return float(token.replace(",", ".")) if token[:1].isdigit() and token.isascii() else None
-    except ValueError:
-        return None
-
-
-def _is_word(token: str) -> bool:
-    """Whether a token can be a word of a name."""
-    return bool(token) and (token[0].isalnum()) and token not in _STOPS
-
-
-# -- the words before and of the noun ----------------------------------------------------------------------------------
-
-
-@dataclass
-class _Determiner:
-    """What stands before the words of a noun."""
-
-    given: bool = False
-    definite: bool = False
-    said: bool = False
-    plural: bool = False
-    indefinite: bool = False
-    number: int | None = None
-    exact: bool = False
-    other: bool = False
-    ordinal: int | None = None
-    key: str = ""
-
-
-def _determiner(cursor: Cursor) -> _Determiner:
-    found = _Determiner()
-    while True:
-        token, after = cursor.peek(), cursor.peek(1)
-        if token in {"one", "any", "each", "all", "both", "either"} and after == "of":
-            cursor.at += 2
-            found.indefinite |= token in {"one", "any", "either"}
-            found.plural |= token in {"each", "all", "both"}
-            found.number, found.exact = (2, True) if token == "both" else (found.number, found.exact)
-        elif token in ARTICLES and not (token == "that" and after in _LINKS):
-            found.definite, found.said = True, token in {"that", "this", "these", "those"}
-            cursor.next()
-        elif token in INDEFINITE:
-            found.indefinite = True
-            found.other |= token == "another"
-            cursor.next()
-        elif token == "both":
-            found.plural, found.number, found.exact = True, 2, True
-            cursor.next()
-        elif token in ALL:
-            found.plural = True
-            cursor.next()
-        elif (token in NUMBERS or token.isdecimal()) and (found.plural or _counts(cursor)):
-            found.number = NUMBERS[token] if token in NUMBERS else int(token)
-            found.exact |= found.definite or found.plural
-            cursor.next()
-        elif token in {"other", "remaining", "others"}:
-            found.other = True
-            found.plural |= token == "others"
-            cursor.next()
-        elif not _take_order(cursor, found):
-            return found
-        found.given = True
-
-
-def _counts(cursor: Cursor) -> bool:
-    """Whether a number counts things: a word of a name, or of their order, follows."""
-    after = cursor.peek(1)
-    known = _is_word(after) and after not in UNITS
-    return known or after in NEAREST | FARTHEST | {"other"} or (cursor.peek() != "one" and after == "of")
-
-
-def _take_order(cursor: Cursor, found: _Determiner) -> bool:
-    """An ordinal or a superlative."""
-    token = cursor.peek()
-    if token in ORDINALS and found.ordinal is None and cursor.peek(1) not in {",", ".", ""}:
-        found.ordinal = ORDINALS[token]
-    elif token in ORDERS and not found.key:
-        found.key = ORDERS[token]
-    elif token in NEAREST | FARTHEST and not found.key and found.given:
-        found.key = "near" if token in NEAREST else "far"
-    else:
-        return False
-    cursor.next()
-    return True
+# -- the noun itself ---------------------------------------------------------------------------------------------------
 
 
 def _head(cursor: Cursor) -> Noun | None:
@@ -268,7 +137,7 @@ def _head(cursor: Cursor) -> Noun | None:
     start = cursor.at
     if cursor.take("each other", "one another"):
         return Noun(words=("each other",))
-    found = _determiner(cursor)
+    found = read_determiner(cursor)
     words, excluded = _words(cursor)
     among = not words and bool(found.key or found.ordinal) and found.number is None
     if not words and (pronoun := _lone(cursor, found, start)) is not None:
@@ -277,7 +146,7 @@ def _head(cursor: Cursor) -> Noun | None:
     while cursor.peek() == "of" or (not words and found.key and cursor.sees("one of")):
         cursor.take("one")
         cursor.next()
-        inner = _determiner(cursor)
+        inner = read_determiner(cursor)
         more, others = _words(cursor)
         if not more:
             raise NotUnderstood(f"what is {' '.join(cursor.tokens[start : cursor.at])!r} of?")
@@ -294,7 +163,7 @@ def _head(cursor: Cursor) -> Noun | None:
 
 
 def _noun(
-    found: _Determiner, words: list[str], excluded: list[str], *, plural: bool, number: int | None, exact: bool
+    found: Determiner, words: list[str], excluded: list[str], *, plural: bool, number: int | None, exact: bool
 ) -> Noun:
     key, ordinal = found.key, found.ordinal
     ranking = Ranking(key=key, rank=ordinal or 1) if key else None
@@ -315,7 +184,7 @@ def _noun(
     )
 
 
-def _lone(cursor: Cursor, found: _Determiner, start: int) -> Noun | None:
+def _lone(cursor: Cursor, found: Determiner, start: int) -> Noun | None:
     """Determiners that stand alone: "both", "all", "that", "the other", "the second"."""
     if found.key or found.ordinal is not None:
         if cursor.sees("of", "one of"):
@@ -346,22 +215,32 @@ def _words(cursor: Cursor) -> tuple[list[str], list[str]]:
             cursor.at += 2
         elif token == "and" and words and words[-1] in COLOURS and cursor.peek(1) in COLOURS:
             cursor.next()
-        elif token in STATES and words and not _is_word(cursor.peek(1)):
-            return words, excluded
-        elif token in SIDE_WORDS and tuple(cursor.tokens[cursor.at : cursor.at + 2])[1:] == ("of",) and words:
-            return words, excluded
-        elif not _is_word(token) or (words and words[-1] in {"it", "them", "itself", "there", "they"}):
-            return words, excluded
-        elif words and (token in NUMBERS or token[0].isdigit()) and cursor.peek(1) in UNITS:
-            return words, excluded
-        elif words and token in {"can", "will", "may", "might", "could"} and cursor.peek(1) in {"be", "go", "not"}:
-            return words, excluded
-        elif words and token in ORDINALS and cursor.peek(1) in {"", ",", ".", "and", "then"}:
-            return words, excluded
-        elif words and (token in GERUNDS or _is_verb(cursor)):
+        elif not is_word(token) or (words and _ends_words(cursor, words[-1])):
             return words, excluded
         else:
             words.append(cursor.next())
+
+
+def _ends_words(cursor: Cursor, last: str) -> bool:
+    """Whether a word that could be part of a name is none here, after the word ``last``."""
+    token, after = cursor.peek(), cursor.peek(1)
+    return (
+        last in {"it", "them", "itself", "there", "they"}
+        or (token in STATES and not is_word(after))
+        or (token in SIDE_WORDS and after == "of")
+        or _starts_length(cursor)
+        or (token in {"can", "will", "may", "might", "could"} and after in {"be", "go", "not"})
+        or (token in ORDINALS and after in {"", ",", ".", "and", "then"})
+        or token in GERUNDS
+        or _is_verb(cursor)
+    )
+
+
+def _starts_length(cursor: Cursor) -> bool:
+    start = cursor.at
+    found = read_length(cursor) is not None
+    cursor.at = start
+    return found
 
 
 def _is_verb(cursor: Cursor) -> bool:
@@ -395,7 +274,7 @@ def _relative(cursor: Cursor, noun: Noun) -> Noun | None:
     comma = cursor.peek() == "," and cursor.peek(1) in _RELATIVES
     if comma:
         cursor.next()
-    if not (cursor.take_any(_RELATIVES) and cursor.take_any(_LINKS)):
+    if not (cursor.take_any(_RELATIVES) and cursor.take_any(LINKS)):
         return None
     cursor.take("located", "placed", "standing", "lying", "sitting", "currently", "the one")
     negated = cursor.take("not")
@@ -428,7 +307,7 @@ def _adjective(cursor: Cursor, noun: Noun) -> Noun | None:
 def _excluding(cursor: Cursor, noun: Noun) -> Noun | None:
     """ "not red", "not the left one": what is excluded."""
     start = cursor.at
-    if cursor.peek() in COLOURS and not _is_word(cursor.peek(1)):
+    if cursor.peek() in COLOURS and not is_word(cursor.peek(1)):
         return replace(noun, excluded=(*noun.excluded, Noun(words=(cursor.next(),))))
     ranked = replace(noun, ranking=None, excluded=(), plural=False, number=None)
     side = _side(cursor, ranked) or _distance(cursor, ranked)
@@ -510,7 +389,11 @@ def _exclusion(cursor: Cursor, noun: Noun, described: bool) -> Noun | None:
     cursor.take(",")
     many = noun.plural or noun.indefinite
     for phrase in EXCEPTIONS:
-        if cursor.sees(phrase) and (many or not (described or phrase == "but")) and not (phrase == "besides" and _sees_moved(cursor)):
+        if (
+            cursor.sees(phrase)
+            and (many or not (described or phrase == "but"))
+            and not (phrase == "besides" and _sees_moved(cursor))
+        ):
             cursor.take(phrase)
             return _all_excluded(cursor, _excluding(cursor, noun))
     if cursor.take("without", "not") and cursor.peek() in COLOURS:

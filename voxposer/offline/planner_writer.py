@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from voxposer.offline.grammar import read_noun, understand
 from voxposer.offline.grounding import Found, ground, holder, is_fixture, is_table
-from voxposer.offline.lexicon import GENERIC
+from voxposer.offline.lexicon import GENERIC, words
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 from voxposer.offline.query_writer import write_query
@@ -25,8 +25,8 @@ ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID, FARTHEST = 10, 20, 10, 18, 22, 1
 # Steps that take a door through its range.
 DOOR_STEPS = 6
 # Objects that "to" puts things into, and those it puts things next to: all that are not supports.
-_CONTAINERS = frozenset("basket tray drawer microwave caddy compartment bowl bin box mug".split())
-_SUPPORTS = frozenset("plate stove cabinet shelf rack towel cloth table burner level top ramekin".split())
+_CONTAINERS = frozenset(words("basket tray drawer microwave caddy compartment bowl bin box mug"))
+_SUPPORTS = frozenset(words("plate stove cabinet shelf rack towel cloth table burner level top ramekin"))
 # More things than this that go to one place are written as a loop, so that the program stays short.
 _LOOP = 3
 
@@ -59,7 +59,11 @@ def _program(blocks: Sequence[Block]) -> list[str]:
     at = 0
     while at < len(blocks):
         alike = [blocks[at]]
-        while blocks[at].thing and at + len(alike) < len(blocks) and _pattern(blocks[at + len(alike)]) == _pattern(blocks[at]):
+        while (
+            blocks[at].thing
+            and at + len(alike) < len(blocks)
+            and _pattern(blocks[at + len(alike)]) == _pattern(blocks[at])
+        ):
             alike.append(blocks[at + len(alike)])
         if len(alike) < _LOOP:
             alike = alike[:1]
@@ -162,7 +166,9 @@ class _Planner:
                 raise NotUnderstood(f"{str(avoidance.thing)!r} is to be kept away from, and to be put something at")
         for action in meant.forbidden:
             if any(self._is_same(action, other) for other in actions):
-                raise NotUnderstood(f"{action.verb.replace('_', ' ')} {action.thing} is asked for, and ruled out with 'not'")
+                raise NotUnderstood(
+                    f"{action.verb.replace('_', ' ')} {action.thing} is asked for, and ruled out with 'not'"
+                )
         for state, noun in meant.kept:
             last = [action.verb for action in actions if self._key(action.thing) == self._key(noun)]
             wanted = f"turn_{state}" if state in {"on", "off"} else state
@@ -195,12 +201,16 @@ class _Planner:
                 raise NotUnderstood(f"{action.thing} cannot be put on, in or next to itself")
             if action.place.relation in BESIDE or action.place.relation in {"between", "towards"}:
                 if beside.get(place) == thing:
-                    raise NotUnderstood(f"{action.thing} and {action.place.thing} are each to be put where the other one is")
+                    raise NotUnderstood(
+                        f"{action.thing} and {action.place.thing} are each to be put where the other one is"
+                    )
                 below.pop(thing, None)
                 beside[thing] = place
                 continue
             if below.get(place) == thing:
-                raise NotUnderstood(f"{action.thing} is to be on {action.place.thing}, which is to be on {action.thing}")
+                raise NotUnderstood(
+                    f"{action.thing} is to be on {action.place.thing}, which is to be on {action.thing}"
+                )
             below[thing] = place
 
     def _is_among(self, place: Noun, things: Noun) -> bool:
@@ -288,7 +298,10 @@ class _Planner:
         place = self._settled(action.place, action.thing)
         blocks = []
         for thing in self._things(action.thing, place):
-            goal = _goal(place, self._between(place) if place.relation == "between" else self._half(action.place) + self._place(place))
+            goal = _goal(
+                place,
+                self._between(place) if place.relation == "between" else self._half(action.place) + self._place(place),
+            )
             blocks.append(Block((*_lifted(thing), *goal), thing))
         self._moves.add(ground(action.thing, self._names), place)
         return blocks
@@ -307,7 +320,9 @@ class _Planner:
         if relation == "center":
             relation = "on"
         if relation in {"to", "towards"}:
-            words = {word for name in _place_thing(place, self._names).names for word in (*name.part_words, *name.words)}
+            words = {
+                word for name in _place_thing(place, self._names).names for word in (*name.part_words, *name.words)
+            }
             relation = "in" if words & _CONTAINERS else "on" if words & _SUPPORTS else "near"
         return Place(relation=relation, thing=place.thing, second=place.second, cm=place.cm)
 
@@ -317,7 +332,9 @@ class _Planner:
         found = [self._moves.since_moved(ground(noun, self._names)) for noun in nouns]
         if len(found) == 1:
             if len(found[0].names) != 2 or found[0].noun.ranking or found[0].noun.relation:
-                raise NotUnderstood(f"between which two? {str(place.thing)!r} are {', '.join(n.text for n in found[0].names)}")
+                raise NotUnderstood(
+                    f"between which two? {str(place.thing)!r} are {', '.join(n.text for n in found[0].names)}"
+                )
             return " and ".join(f"the {name.text}" for name in found[0].names)
         if found[0].text == found[1].text:
             raise NotUnderstood(f"between {found[0].text} and itself is no place")
@@ -417,7 +434,9 @@ def _holding(relation: str) -> str:
 def _with_words(noun: Noun, words: tuple[str, ...], names: Sequence[Name]) -> Noun:
     """The noun with other words; a name itself stays, so that its own part is found."""
     whole = [name for name in names if name.text in noun.words]
-    words = tuple(part for word in words for part in ((word.split("_")) if whole and word == whole[0].text else (word,)))
+    words = tuple(
+        part for word in words for part in ((word.split("_")) if whole and word == whole[0].text else (word,))
+    )
     return Noun(
         words=tuple(word for word in words if not word.isdigit()),
         ranking=noun.ranking,

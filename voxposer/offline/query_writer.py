@@ -63,7 +63,20 @@ class _Locator:
     def __init__(self, names: Sequence[Name]) -> None:
         self._names = names
         self._scaled = False
-        self._used: set[str] = {"cm", "distances", "face", "objects", "np", "i", "foot", "gap", "high", "low", "middle", "thing"}
+        self._used: set[str] = {
+            "cm",
+            "distances",
+            "face",
+            "objects",
+            "np",
+            "i",
+            "foot",
+            "gap",
+            "high",
+            "low",
+            "middle",
+            "thing",
+        }
 
     def locate(self, noun: Noun, inside: str = "") -> tuple[list[str], str]:
         """Lines, and the expression that holds the object after them.

@@ -1,7 +1,7 @@
 """What descriptions still mean after some objects were moved.
 
-A program looks at the scene when it runs, so "the left bowl" means another bowl once the left one has been carried to the
-right. Here a description of what is meant now is found: what was moved is named by where it is, and the rest by its
+A program looks at the scene when it runs, so "the left bowl" means another bowl once the left one has been carried to
+the right. Here a description of what is meant now is found: what was moved is named by where it is, and the rest by its
 order among what is left.
 """
 
@@ -83,7 +83,9 @@ class Moves:
             if len(found.names) - len(excluded) == 1:
                 return found.noun
             out = ", ".join(map(str, excluded))
-            raise NotUnderstood(f"once one of several is moved, {out!r} cannot be told any more; name those that are meant")
+            raise NotUnderstood(
+                f"once one of several is moved, {out!r} cannot be told any more; name those that are meant"
+            )
         named = tuple(out for out in found.noun.excluded if out.is_named)
         return replace(found.noun, excluded=named, ranking=replace(excluded[0].ranking, key=_OPPOSITE[key]))
 
@@ -99,7 +101,10 @@ class Moves:
         return replace(found, names=left, noun=replace(found.noun, excluded=(*found.noun.excluded, *out)))
 
     def _check_refs(self, noun: Noun) -> None:
-        refs = [*(noun.relation.refs if noun.relation else ()), *([noun.ranking.ref] if noun.ranking and noun.ranking.ref else [])]
+        refs = [
+            *(noun.relation.refs if noun.relation else ()),
+            *([noun.ranking.ref] if noun.ranking and noun.ranking.ref else []),
+        ]
         for ref in refs:
             if not is_table(ref):
                 self._check_refs(ground(ref, self._names).noun)
@@ -107,7 +112,11 @@ class Moves:
     def since_moved(self, found: Found) -> Found:
         """The object described so that the description holds now, after what was moved."""
         for moved, place, count in self._moved:
-            if found.is_settled or found.noun.plural or not set(moved.names[:1] if moved.is_settled else moved.names) & set(found.names):
+            if (
+                found.is_settled
+                or found.noun.plural
+                or not set(moved.names[:1] if moved.is_settled else moved.names) & set(found.names)
+            ):
                 continue
             if moved.is_settled:
                 found = self._without_name(found, moved.names[0])
@@ -188,6 +197,11 @@ def _among_rest(ranking: Ranking | None, gone: Ranking | None, count: int) -> Ra
         return ranking
     if ranking.key == "middle" or gone.key == "middle":
         raise NotUnderstood(f"once one of {count} is moved, which is in the middle cannot be told any more")
-    if _OPPOSITE.get(ranking.key) == gone.key and ranking.rank > 0 and gone.rank > 0 and ranking.rank > count - gone.rank + 1:
+    if (
+        _OPPOSITE.get(ranking.key) == gone.key
+        and ranking.rank > 0
+        and gone.rank > 0
+        and ranking.rank > count - gone.rank + 1
+    ):
         return replace(ranking, rank=ranking.rank - 1)
     return ranking

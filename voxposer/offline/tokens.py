@@ -11,7 +11,7 @@ import unicodedata
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TypeVar
 
-from voxposer.offline.lexicon import NUMBERS, UNITS
+from voxposer.offline.lexicon import NUMBERS, UNITS, words
 
 T = TypeVar("T")
 # A name of the scene (bowl_1), a number with its decimals, a word with its apostrophes, or one sign.
@@ -33,7 +33,10 @@ _SPELLINGS = (
     (r"\b(?:cannot|can't)\b", "can not"),
     (r"\bwon't\b", "will not"),
     (r"\b(\w+)'s (left|right|front|back|rear)(?: hand)?(?: side)?(?=\s*(?:$|[.,;!?]|and\b|then\b))", r"\2 of the \1"),
-    (r"\b(?:its|their) (left|right|front|back|rear)(?: hand)?(?: side)?(?=\s*(?:$|[.,;!?]|and\b|then\b))", r"the \1 of it"),
+    (
+        r"\b(?:its|their) (left|right|front|back|rear)(?: hand)?(?: side)?(?=\s*(?:$|[.,;!?]|and\b|then\b))",
+        r"the \1 of it",
+    ),
     (r"(?<=\w)'s\b|(?<=s)'(?=\s)", " "),
     (r"\bfrying pan(s?)\b", r"frypan\1"),
     (r"\b(?:layer|level) of (?:the )?drawers?\b", "drawer"),
@@ -124,7 +127,9 @@ def is_side_end(cursor: Cursor) -> bool:
 
 
 _AFTER_SIDE = frozenset(
-    """and then on onto in into at to next near beside between from under inside behind not but before after once without
-    while except besides which that should must needs need has have is are goes go belongs belong , . or ) can could will
-    inside upon over with instead at towards toward where as""".split()
+    words(
+        """and then on onto in into at to next near beside between from under inside behind not but before after once
+        without while except besides which that should must needs need has have is are goes go belongs belong , . or )
+        can could will upon over with instead towards toward where as"""
+    )
 )
