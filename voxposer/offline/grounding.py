@@ -6,6 +6,7 @@ fit, and what is left of the description to choose between them by position or s
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -60,7 +61,7 @@ def ground(noun: Noun, names: Sequence[Name]) -> Found:
     for option in _options(noun):
         found = _generic(option, names) if option.words[-1] in GENERIC else matching(option.words, names)
         if found:
-            return _checked(_levelled(_without_excluded(Found(option, found), names)))
+            return _checked(_levelled(_without_refs(_without_excluded(Found(option, found), names), names)))
     listed = ", ".join(name.text for name in names) or "no objects"
     raise NotUnderstood(f"{str(noun)!r} fits none of {listed}")
 
@@ -107,6 +108,23 @@ def _without_excluded(found: Found, names: Sequence[Name]) -> Found:
     if not left:
         raise NotUnderstood(f"{str(found.noun)!r} leaves nothing")
     return Found(replace(found.noun, excluded=tuple(dynamic)), left)
+
+
+def _without_refs(found: Found, names: Sequence[Name]) -> Found:
+    """The names without the objects that describe them: "the thing nearest to the milk" is not the milk."""
+    left = found.names
+    for ref in refs_of(found.noun):
+        with contextlib.suppress(NotUnderstood):
+            out = ground(ref, names) if not is_table(ref) else None
+            if out is not None and out.is_settled:
+                left = tuple(name for name in left if name != out.names[0])
+    return Found(found.noun, left or found.names)
+
+
+def refs_of(noun: Noun) -> list[Noun]:
+    """The objects that describe another one."""
+    nearest = [noun.ranking.ref] if noun.ranking is not None and noun.ranking.ref is not None else []
+    return [*(noun.relation.refs if noun.relation is not None else ()), *nearest]
 
 
 def _levelled(found: Found) -> Found:

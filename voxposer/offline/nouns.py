@@ -126,6 +126,8 @@ def _bare_side(cursor: Cursor) -> str:
 
 def _ends_bare(cursor: Cursor, kind: str) -> bool:
     """A preposition with nothing behind it that can do without only at some places: "put it in" but not "between"."""
+    if kind == "to" and cursor.peek() in {"be", "go", "get", "have", "stay"}:
+        return True
     return kind in {"to", "from", "towards"} and cursor.at_end
 
 

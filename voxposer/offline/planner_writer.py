@@ -197,7 +197,7 @@ class _Planner:
             if action.verb not in {"put", "push"} or action.place is None or is_table(action.place.thing):
                 continue
             thing, place = self._key(action.thing), self._key(action.place.thing)
-            if thing == place or self._is_among(action.place.thing, action.thing):
+            if thing == place or self._is_among(action.place, action.thing):
                 raise NotUnderstood(f"{action.thing} cannot be put on, in or next to itself")
             if action.place.relation in BESIDE or action.place.relation in {"between", "towards"}:
                 if beside.get(place) == thing:
@@ -213,9 +213,9 @@ class _Planner:
                 )
             below[thing] = place
 
-    def _is_among(self, place: Noun, things: Noun) -> bool:
+    def _is_among(self, place: Place, things: Noun) -> bool:
         """Whether a place is one of the things that are to be put there."""
-        there, moved = ground(place, self._names), ground(things, self._names)
+        there, moved = _place_thing(place, self._names), ground(things, self._names)
         if moved.noun.words[-1] in GENERIC:
             return False
         several = moved.noun.plural and moved.noun.number in {None, len(moved.names)} and not moved.noun.relation

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 from voxposer.offline.grammar import read_noun
-from voxposer.offline.grounding import Found, ground, holder, is_table
+from voxposer.offline.grounding import Found, ground, holder, is_table, refs_of
 from voxposer.offline.meaning import Noun, Ranking, Relation
 from voxposer.offline.names import Name, NotUnderstood, read_names
 from voxposer.offline.rules import variable
@@ -119,6 +120,9 @@ class _Locator:
         for excluded in noun.excluded:
             lines += self._without(excluded, several)
             left -= 1
+        for ref in refs_of(noun):
+            if not is_table(ref) and _could_be(ground(ref, self._names), found):
+                lines += self._without(replace(ref, plural=False), several)
         if noun.relation and noun.ranking and noun.relation.kind not in _BESIDE:
             raise NotUnderstood(f"{str(noun)!r} says both an order and a place; say one")
         if noun.relation and noun.ranking:
@@ -208,6 +212,11 @@ class _Locator:
         chosen = f"[thing for thing in {several} if {'not ' if relation.negated else ''}{condition}]"
         candidates = self._name("candidates")
         return [*lines, f"{candidates} = {chosen}"], candidates
+
+
+def _could_be(ref: Found, found: Found) -> bool:
+    """Whether an object that describes another could be that one, so that it must be left out when the program runs."""
+    return not ref.is_settled and not ref.noun.plural and bool(set(ref.names) & set(found.names))
 
 
 def _at(values: str, least: bool, rank: int) -> str:

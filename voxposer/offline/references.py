@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from voxposer.offline.grounding import Found, ground, is_table
+from voxposer.offline.grounding import Found, ground, is_table, refs_of
 from voxposer.offline.lexicon import GENERIC
 from voxposer.offline.meaning import BESIDE, Noun, Place, Ranking, Relation
 from voxposer.offline.names import Name, NotUnderstood
@@ -101,11 +101,7 @@ class Moves:
         return replace(found, names=left, noun=replace(found.noun, excluded=(*found.noun.excluded, *out)))
 
     def _check_refs(self, noun: Noun) -> None:
-        refs = [
-            *(noun.relation.refs if noun.relation else ()),
-            *([noun.ranking.ref] if noun.ranking and noun.ranking.ref else []),
-        ]
-        for ref in refs:
+        for ref in refs_of(noun):
             if not is_table(ref):
                 self._check_refs(ground(ref, self._names).noun)
 
