@@ -191,7 +191,7 @@ def holder(relation: str, name: Name, names: Sequence[Name]) -> Name | None:
     found = _part_of(name.text, names, wanted.get(relation, ()))
     drawers = [part.text for part in names if part.whole == name.text and "drawer" in part.part_words]
     if found is None and relation in {"in", "under"} and drawers:
-        raise NotUnderstood(f"in which of {', '.join(drawers)}?")
+        raise NotUnderstood(f"in which drawer? There are {', '.join(drawers)}")
     return found
 
 

@@ -8,12 +8,12 @@ by comparing positions when the subtask runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from voxposer.offline.grammar import read_noun, understand
-from voxposer.offline.grounding import Found, ground, holder, is_fixture, is_table
+from voxposer.offline.grounding import Found, ground, holder, is_fixture, is_table, refs_of
 from voxposer.offline.lexicon import GENERIC, words
-from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place
+from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place, Ranking
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 from voxposer.offline.query_writer import write_query
 from voxposer.offline.references import Moves
@@ -29,6 +29,8 @@ _CONTAINERS = frozenset(words("basket tray drawer microwave caddy compartment bo
 _SUPPORTS = frozenset(words("plate stove cabinet shelf rack towel cloth table burner level top ramekin"))
 # More things than this that go to one place are written as a loop, so that the program stays short.
 _LOOP = 3
+# What orders by size, which stays the same while an object is carried.
+_SIZES = frozenset(["large", "small", "tall", "short", "long"])
 
 
 @dataclass(frozen=True)
@@ -248,21 +250,34 @@ class _Planner:
             write_query(phrase, self._objects)
         for name in ground(noun, self._names).names:
             if is_fixture(name, self._names):
-                raise NotUnderstood(f"{name.text} is fixed, or a part, and cannot be moved")
+                raise NotUnderstood(f"{noun} ({name.text}) is fixed, or a part, and cannot be moved")
         return phrases
 
-    def _place(self, place: Place) -> str:
-        """The destination: the part of the object that the relation refers to."""
+    def _place(self, place: Place, thing: Noun) -> str:
+        """The destination of a thing: the part of the object that the relation refers to."""
         if is_table(place.thing):
             return "the table"
-        found = _place_thing(place, self._names)
+        found = self._moves.while_held(self._moves.since_moved(_place_thing(place, self._names)), thing)
         if place.relation in BESIDE | {"to", "towards"}:
-            return self._single(self._moves.since_moved(found))
-        found = self._moves.since_moved(found)
+            return self._single(found)
         part = holder(_holding(place.relation), found.names[0], self._names) if found.is_settled else None
         if place.relation == "under" and part is None and not (found.is_settled and found.names[0].is_part):
             raise NotUnderstood(f"nothing can be put under {place.thing}")
         return f"the {part.text}" if part else self._single(found)
+
+    def _arrived_at(self, place: Place, thing: Noun, words: str) -> str:
+        """The destination once the hand with the thing is above it, where it is described by that thing."""
+        if is_table(place.thing):
+            return words
+        found = _place_thing(place, self._names)
+        keys = [self._key(ref) for ref in refs_of(found.noun) if not is_table(ref)]
+        if found.is_settled or self._key(thing) not in keys:
+            return words
+        held = ground(thing, self._names)
+        if not held.is_settled and not (held.noun.ranking and held.noun.ranking.key in _SIZES):
+            raise NotUnderstood(f"once {thing} is carried, {str(found.noun)!r} cannot be told any more")
+        nearest = Ranking(key="near", ref=Noun(words=(held.names[0].text,)) if held.is_settled else held.noun)
+        return f"{words.removesuffix(found.text)}{replace(found.noun, relation=None, ranking=nearest)}"
 
     def _single(self, found: Found) -> str:
         if found.noun.plural and not found.is_settled:
@@ -298,10 +313,11 @@ class _Planner:
         place = self._settled(action.place, action.thing)
         blocks = []
         for thing in self._things(action.thing, place):
-            goal = _goal(
-                place,
-                self._between(place) if place.relation == "between" else self._half(action.place) + self._place(place),
-            )
+            if place.relation == "between":
+                goal = _goal(place, self._between(place))
+            else:
+                words = self._half(action.place) + self._place(place, action.thing)
+                goal = _goal(place, words, self._arrived_at(place, action.thing, words))
             blocks.append(Block((*_lifted(thing), *goal), thing))
         self._moves.add(ground(action.thing, self._names), place)
         return blocks
@@ -349,7 +365,7 @@ class _Planner:
 
     def _push(self, action: Action) -> list[Block]:
         assert action.place is not None
-        things, place = self._things(action.thing), self._place(action.place)
+        things, place = self._things(action.thing), self._place(action.place, action.thing)
         if len(things) > 1 or action.place.cm is not None or action.place.relation == "between":
             raise NotUnderstood(f"pushing {action.thing} there is not understood; 'move' is")
         goal = _SIDES_SAID.get(action.place.relation, "towards")
@@ -411,16 +427,17 @@ def _lifted(thing: str) -> list[str]:
     return [f"grasp {thing}", f"move up by {LIFT}cm", f"grasp {thing} again if nothing is held"]
 
 
-def _goal(place: Place, words: str) -> list[str]:
-    """The sentences that bring what is held to a place."""
+def _goal(place: Place, words: str, arrived: str = "") -> list[str]:
+    """The sentences that bring what is held to a place; ``arrived`` are words for it once the hand is there."""
+    arrived = arrived or words
     if place.relation in _SIDES_SAID:
         gap = f"{place.cm:g}cm " if place.cm is not None else ""
-        goal = f"{gap}{_SIDES_SAID[place.relation]} {words}"
-        return [f"move to {ABOVE}cm above the table {goal}", f"place it {goal}", *_LEAVE]
+        goal = f"{gap}{_SIDES_SAID[place.relation]}"
+        return [f"move to {ABOVE}cm above the table {goal} {words}", f"place it {goal} {arrived}", *_LEAVE]
     word = "in" if place.relation == "in" else "on"
     if words.endswith(("_inside", "_level")):
         return [f"move to {BEFORE}cm in front of {words}", f"place it {word} {words}", *_back_from(words, BEFORE)]
-    return [f"move to {ABOVE}cm above {words}", f"place it {word} {words}", *_LEAVE]
+    return [f"move to {ABOVE}cm above {words}", f"place it {word} {arrived}", *_LEAVE]
 
 
 def _back_from(handle: str, cm: int = ABOVE) -> list[str]:

@@ -115,7 +115,7 @@ class _Locator:
         noun = found.noun
         lines, left = [], len(found.names)
         for count, relation in noun.moved:
-            lines += [*self._without_moved(count, relation, several)]
+            lines += self._without_moved(count, relation, several)
             left -= count
         for excluded in noun.excluded:
             lines += self._without(excluded, several)
@@ -156,6 +156,8 @@ class _Locator:
 
     def _without_moved(self, count: int, relation: Relation, several: str) -> list[str]:
         """Lines that leave out those that are where others were put."""
+        if relation.refs[0].words == ("hand",):
+            return [f"{several} = [thing for thing in {several} if not thing.held]"]
         lines, goal = self._goal(relation)
         flat = relation.kind not in {"on", "in", "top_of", "under"}
         lines += [*self._scale(), _distances(several, goal, flat=flat)]

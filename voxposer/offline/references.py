@@ -21,6 +21,9 @@ _OPPOSITE = {
 }  # fmt: skip
 
 
+_IN_HAND = Relation(kind="in", refs=(Noun(words=("hand",)),))
+
+
 class Moves:
     """The objects that were put somewhere so far.
 
@@ -124,6 +127,33 @@ class Moves:
                 return replace(found, noun=replace(_plain(found.noun), relation=relation))
             found = self._among_others(found, moved, place, count)
         return found
+
+    def while_held(self, found: Found, thing: Noun) -> Found:
+        """A place described so that the description holds while an object that would fit it too is carried there."""
+        held = ground(thing, self._names)
+        if found.is_settled or not set(held.names) & set(found.names):
+            return found
+        if held.is_settled:
+            return self._without_name(found, held.names[0])
+        if held.noun.plural:
+            raise NotUnderstood(f"{str(thing)!r} are carried one by one, and {str(found.noun)!r} changes its meaning")
+        if self._since(found):
+            return found
+        noun, ranking = found.noun, found.noun.ranking
+        if held.names == found.names:
+            ranking = _among_rest(ranking, held.noun.ranking, len(found.names))
+        elif ranking and (ranking.key == "middle" or abs(ranking.rank) != 1):
+            raise NotUnderstood(f"once {thing} is carried, {str(noun)!r} cannot be told any more")
+        excluded = tuple(out for out in noun.excluded if _bare(out) != _bare(held.noun))
+        moved = (*noun.moved, (1, _IN_HAND))
+        if len(found.names) - sum(count for count, _ in moved) == 1:
+            return replace(found, noun=replace(_plain(noun), moved=moved))
+        return replace(found, noun=replace(noun, ranking=ranking, excluded=excluded, moved=moved))
+
+    def _since(self, found: Found) -> bool:
+        """Whether it is described by where it was put."""
+        places = [self._relation(place) for _, place, _ in self._moved]
+        return found.noun.relation in [*places, *(Relation(kind="outside", refs=place.refs) for place in places)]
 
     def _without_name(self, found: Found, gone: Name) -> Found:
         """Another object than one that was moved and has a name of its own."""

@@ -130,6 +130,6 @@ _AFTER_SIDE = frozenset(
     words(
         """and then on onto in into at to next near beside between from under inside behind not but before after once
         without while except besides which that should must needs need has have is are goes go belongs belong , . or )
-        can could will upon over with instead towards toward where as"""
+        could will upon over with instead towards toward where as"""
     )
 )
