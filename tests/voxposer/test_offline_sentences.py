@@ -116,6 +116,7 @@ def test_empty_and_long_texts_are_refused(text: str) -> None:
         ("setze die Flasche auf den Teller", "setze"),
         ("put the bottle onto the Käsebrett", "käsebrett"),
         ("put both plates on the stove", "both plate"),
+        ("put the left bowl and the bottle on the plate and the plate", "moved too"),
         ("put the bottle and the plate into themselves", "themselves"),
     ],
 )

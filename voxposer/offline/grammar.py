@@ -91,6 +91,7 @@ class _Reader:
         self._last: tuple[str, Place | None] = ("", None)
         self._mentions: list[Noun] = []
         self._places: list[Noun] = []
+        self._phrase: Phrase | None = None
         self._put_on: Action | None = None
         self._actions: list[tuple[float, Action]] = []
         self._avoid: list[Avoidance] = []
@@ -380,6 +381,8 @@ class _Reader:
     def _place(self, phrase: Phrase | None, thing: Noun, placed: list[Action], clause: Clause) -> Place | None:
         if phrase is None:
             before = placed[-1].place if placed else None
+            if before is not None and before.thing.words[-1:] == thing.words[-1:]:
+                raise NotUnderstood(f"is {thing} to be moved too, or another place? {clause.said!r}")
             return self._last[1] if clause.verb in {"again", "same"} else before
         if phrase.thing is None and phrase.kind in BESIDE and not (placed and placed[-1].place):
             raise NotUnderstood(f"how far {phrase.said!r} is {thing} to go?")
@@ -391,6 +394,7 @@ class _Reader:
             raise NotUnderstood(f"'{phrase.said or phrase.kind}' is not a destination")
         second = self._resolved(phrase.second, thing) if phrase.second else None
         target = self._place_thing(phrase, thing, placed, clause)
+        self._phrase = phrase
         self._mention(target)
         self._places.append(target)
         return Place(relation=phrase.kind, thing=target, second=second, cm=phrase.cm)
@@ -406,6 +410,8 @@ class _Reader:
             if noun is not None and len(inner := _inner(thing)) > 1:
                 return inner[-2]
             before = placed[-1].place if placed else self._last[1] if clause.verb == "again" else None
+            if before is not None and phrase is self._phrase:
+                return before.thing
             last = self._moved_last(placed)
             bearing = {"on", "top_of", "in"} if last is not None and last.words[-1] in _BEARERS else set()
             where = before.relation if before else self._last[1].relation if self._last[1] else ""

@@ -48,8 +48,11 @@ def write_planner(instruction: str, objects: Sequence[str]) -> str:
         NotUnderstood: the message says what is not understood.
     """
     names = read_names(objects)
-    meant = understand(instruction, objects)
-    blocks = _Planner(names).plan(meant)
+    try:
+        meant = understand(instruction, objects)
+        blocks = _Planner(names).plan(meant)
+    except RecursionError:
+        raise NotUnderstood(f"{instruction.strip()[:80]!r} describes objects by one another without an end") from None
     extras = _extras(meant, names)
     said = [Block(tuple(_with(sentence, extras) for sentence in block.sentences), block.thing) for block in blocks]
     return "\n".join([*_program(said), "# done"])

@@ -54,7 +54,10 @@ def write_query(query: str, objects: Sequence[str]) -> str:
     for alias, known in (("gripper", _HANDS), ("table", _TABLES), ("held object", _HELD)):
         if bare in known and not any(name.text.lower() == bare for name in names):
             return f"ret_val = detect({alias!r})"
-    lines, found = _Locator(names).locate(read_noun(text))
+    try:
+        lines, found = _Locator(names).locate(read_noun(text))
+    except RecursionError:
+        raise NotUnderstood(f"{text[:80]!r} describes objects by one another without an end") from None
     return "\n".join([*lines, f"ret_val = {found}"])
 
 
