@@ -65,6 +65,7 @@ class ToyWorld:
         quat: its orientation, wxyz.
         is_open: whether its fingers are apart.
         held: the thing or part between its fingers, "" for none.
+        carried: what stands in or on it.
         shift: name -> how far a thing has moved, or a part has been drawn.
         turned: knob -> radians.
         log: what has been grasped, put, pushed and turned, in order.
@@ -77,6 +78,7 @@ class ToyWorld:
     quat: np.ndarray = field(default_factory=lambda: DOWN.copy())
     is_open: bool = True
     held: str = ""
+    carried: list[str] = field(default_factory=list)
     shift: dict[str, np.ndarray] = field(default_factory=dict)
     turned: dict[str, float] = field(default_factory=dict)
     log: list[tuple[str, str]] = field(default_factory=list)
@@ -264,7 +266,8 @@ class ToyWorld:
     def _move(self, goal: np.ndarray) -> None:
         way, self.ee = goal - self.ee, goal
         if self.held in self.snapshot.objects:
-            self.shift[self.held] = self._moved(self.held) + way
+            for name in (self.held, *self.carried):
+                self.shift[name] = self._moved(name) + way
             return
         for name, part in self.snapshot.parts.items():
             axis = self._opening(name)
@@ -314,8 +317,21 @@ class ToyWorld:
                 name for name in (*self.snapshot.movable, *parts) if np.linalg.norm(self._grasp(name) - self.ee) < 0.03
             ]
             self.held = min(at, key=lambda name: float(np.linalg.norm(self._grasp(name) - self.ee)), default="")
+            self.carried = self._resting_on(self.held) if self.held in self.snapshot.objects else []
             self.log.append(("grasp", self.held))
         self.is_open = is_open
+
+    def _resting_on(self, name: str) -> list[str]:
+        """The things that stand in or on a thing, and on those."""
+        found, rest = [name], set(self.snapshot.movable) - {name}
+        for carrier in found:
+            low, high = self.bounds(carrier)
+            for other in sorted(rest):
+                (x, y), z = self.bounds(other).mean(axis=0)[:2], self.bounds(other)[0][2]
+                if low[0] < x < high[0] and low[1] < y < high[1] and low[2] < z < high[2] + 0.03:
+                    found.append(other)
+                    rest.remove(other)
+        return found[1:]
 
     # -- the goal ------------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from voxposer.offline.rules import BESIDE, CM, SIDES, THING, Groups, Rules, choose, get
+from voxposer.offline.rules import BESIDE, CM, GAP, SIDES, THING, Groups, Rules, choose, get
 
 # Room left before and after a push, centimetres; a pushed part is released while it slides.
 PUSH_ROOM, PUSH_RUN = 5, 8
@@ -104,12 +104,17 @@ def _place(match: Groups) -> list[str]:
 
 
 def _hover_beside(match: Groups) -> list[str]:
-    spot = f"a point {match['cm']}cm above the table {match['side']} {match['thing']} for the held object"
+    spot = f"a point {match['cm']}cm above the table {_side(match)} {match['thing']} for the held object"
     return [_GRIPPER, *_run(affordance=spot)]
 
 
+def _side(match: Groups) -> str:
+    """Where beside something, with the gap if one is said."""
+    return f"{match['room']}cm {match['side']}" if match["room"] else match["side"]
+
+
 def _place_beside(match: Groups) -> list[str]:
-    spot = f"a point on the table {match['side']} {match['thing']} for the held object"
+    spot = f"a point on the table {_side(match)} {match['thing']} for the held object"
     return [_GRIPPER, *_run(affordance=spot), *_run(gripper="open everywhere")]
 
 
@@ -183,17 +188,18 @@ def _grip(match: Groups) -> list[str]:
     return [_GRIPPER, *_run(gripper=f"{match['state'].lower()} everywhere")]
 
 
+_AT = f"{BESIDE}|between|at the center of"
 _COMPOSER: Rules = (
     (rf"(?:grasp|grab|pick up) {THING} again if nothing is held", _grasp_again),
     (rf"(?:grasp|grab|pick up) {THING}", _grasp),
     (r"(?:go )?back to (?:the )?default(?: pose)?|go back to default", lambda _: ["reset_to_default_pose()"]),
     (r"(?P<state>open|close)(?: the)? gripper", _grip),
     (rf"move (?P<direction>{'|'.join(_DIRECTIONS)}) (?:by|for) {CM}", _move_by),
-    (rf"move to {CM} above the table (?P<side>{BESIDE}) {THING}", _hover_beside),
+    (rf"move to {CM} above the table {GAP}(?P<side>{_AT}) {THING}", _hover_beside),
     (rf"move to {CM} (?P<where>above|on top of) {THING}", _hover),
     (rf"move to {CM} (?P<where>in front of) (?P<thing>(?:the )?\S+_(?:inside|level))", _hover),
     (rf"move to (?:{CM} )?(?P<side>{'|'.join(SIDES)}) {THING}", _move_to),
-    (rf"place it (?P<side>{BESIDE}) {THING}", _place_beside),
+    (rf"place it {GAP}(?P<side>{_AT}) {THING}", _place_beside),
     (rf"place it (?:on|in|under|inside) {THING}", _place),
     (rf"move back from {THING} by {CM}(?P<closed> with the gripper closed)?", _back_off),
     (rf"pull {THING} by {CM}", _pull),

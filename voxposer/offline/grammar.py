@@ -1,406 +1,496 @@
-"""Grammar of the offline writer: from an instruction to actions on noun phrases.
+"""From an instruction to actions: clauses in the order of doing, pronouns resolved, omitted words filled in.
 
-English as in LIBERO and SIMPLER ("take the black bowl from the top drawer and put it on the plate") comes in;
-:class:`Action` s go out in order, with pronouns resolved and implicit objects filled in. No entity names and no
-positions are known here: a :class:`Noun` holds words and relations to other objects.
+English comes in ("take the black bowl from the top drawer, put it on the plate, and then close the drawer"); an
+:class:`~voxposer.offline.meaning.Instruction` goes out. Positions are not known here. The names of the scene's objects
+may be given; they only decide what "one" stands for in "the red one", and which of several earlier objects is meant.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from voxposer.offline.names import COLOURS, SIDES, NotUnderstood, singular
+from voxposer.offline.clause import Clause, Group
+from voxposer.offline.clauses import read_clauses
+from voxposer.offline.grounding import ground, is_table
+from voxposer.offline.lexicon import SIDE_WORDS, SIZES, words
+from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place, Ranking, Relation
+from voxposer.offline.names import COLOURS, Name, NotUnderstood, matching, read_names
+from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, read_phrase, read_phrases
+from voxposer.offline.tokens import Cursor, tokenize
 
-
-@dataclass(frozen=True, kw_only=True)
-class Relation:
-    """Relation of an object to others.
-
-    Attributes:
-        kind: on, in, top_of, under, near, between, from, outside, center, or left_of, right_of, front_of, back_of.
-        refs: the other objects; two for between.
-        negated: whether the relation must not hold.
-    """
-
-    kind: str
-    refs: tuple[Noun, ...] = ()
-    negated: bool = False
+# Longer texts are no instructions, and cost time.
+_MOST_WORDS = 200
 
 
-@dataclass(frozen=True, kw_only=True)
-class Noun:
-    """A noun phrase.
-
-    Attributes:
-        words: content words, singular, the noun itself last; what it is a part of comes first.
-        side: which of several equal objects: left, right, front, back, middle, top or bottom.
-        relation: to other objects.
-        plural: the phrase is in the plural, or has "both" or "all".
-        indefinite: the phrase has "a" or "any": every matching object will do.
-    """
-
-    words: tuple[str, ...]
-    side: str | None = None
-    relation: Relation | None = None
-    plural: bool = False
-    indefinite: bool = False
-
-    @property
-    def is_pronoun(self) -> bool:
-        """Whether it refers to an object named before."""
-        return self.words in {("it",), ("them",), ("one",)}
-
-    def __str__(self) -> str:
-        """The phrase in words, which this grammar parses to the same noun."""
-        article = "any" if self.indefinite else "the"
-        side = f" {_SIDE_WORDS[self.side]}" if self.side else ""
-        relation = f" {_relation_text(self.relation)}" if self.relation else ""
-        return f"{article} {' '.join(self.words)}{side}{relation}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Place:
-    """A destination: ``relation`` on, in, top_of, under, near, left_of, right_of, front_of, back_of an object."""
-
-    relation: str
-    thing: Noun
-
-
-@dataclass(frozen=True, kw_only=True)
-class Action:
-    """One action: ``verb`` is pick, put, push, open, close, turn_on or turn_off."""
-
-    verb: str
-    thing: Noun
-    place: Place | None = None
-
-
-_SIDE_WORDS = {
-    "left": "on the left",
-    "right": "on the right",
-    "front": "at the front",
-    "back": "at the back",
-    "middle": "in the middle",
-    "top": "at the top",
-    "bottom": "at the bottom",
-}
-_RELATION_WORDS = {
-    "near": "next to",
-    "top_of": "on top of",
-    "left_of": "to the left of",
-    "right_of": "to the right of",
-    "front_of": "in front of",
-    "back_of": "behind",
-    "center": "at the center of",
-}
-_SIDE = r"(left|right|front|back|rear|middle|center|centre|top|bottom)"
-_SAME_SIDE = {"rear": "back", "center": "middle", "centre": "middle", "upper": "top", "lower": "bottom"}
-_ENDS = r"(?=\s+(?:and|then|on|onto|in|into|at|to|next|near|beside|between|from|under|inside|behind|not)\b|\s*,|\s*$)"
-
-# Normalisation of spelling before parsing: pattern, replacement.
-_SPELLINGS = (
-    (r"[\u2018\u2019\u02bc]", "'"),
-    (r"-", " "),
-    (r"\b(?:please|kindly)\b|\b(?:can|could|would|will) you\b|[.?!]+$", ""),
-    (r"\bthe ((?:\w+ ){0,2}\w+)'s ((?:\w+ )?\w+)", r"the \2 of the \1"),
-    (r"\b(\w+)'s ((?:\w+ )?\w+)", r"the \2 of the \1"),
-    (r"\bfrying pan(s?)\b", r"frypan\1"),
-    (r"\b(?:layer|level) of (?:the )?drawers?\b", "drawer"),
-    (rf"\b({'|'.join(sorted(COLOURS))}) (?:and|&) (?=(?:{'|'.join(sorted(COLOURS))})\b)", r"\1 "),
-)
-# Prepositions, the longest first, as one token each.
-_PREPOSITIONS = (
-    (
-        r"\b(?:from|at|in|on) (?:the )?(?:(?:center|centre|middle) of the table|table (?:center|centre))\b",
-        "CENTER table",
-    ),
-    (r"\bat the center of\b", "CENTER"),
-    (r"\bon (?:the )?top of\b|\bto (?:the )?top of\b|\bonto (?:the )?top of\b", "TOP_OF"),
-    (r"\b(?:to|on|at|in) (?:the )?(left|right|front|back)(?: hand)?(?: side)? of\b|\b(left|right) of\b", r"\1\2_OF"),
-    (rf"\b(?:on|at|in|from) the {_SIDE}(?: side)?\b{_ENDS}", r"AT_\1"),
-    (rf"\bto (?:the )?(left|right|front|back)(?: side)?\b{_ENDS}", r"\1_OF"),
-    (r"\bin front of\b", "front_OF"),
-    (r"\bbehind\b", "back_OF"),
-    (r"\b(?:next to|adjacent to|close to|near to|beside|alongside|near|by)\b", "NEAR"),
-    (r"\boutside(?: of)?\b", "OUTSIDE"),
-    (r"\b(?:inside of|inside|into|within|in)\b", "IN"),
-    (r"\b(?:onto|upon|on)\b", "ON"),
-    (r"\b(?:underneath|under|below|beneath)\b", "UNDER"),
-    (r"\bbetween\b", "BETWEEN"),
-    (r"\b(?:from|out of|off)\b", "FROM"),
-    (r"\bof\b", "OF"),
-    (r"\b(?:and|&)\b|,", " AND "),
-    (r"\bnot\b", "NOT"),
-)
-_VERBS = (
-    ("turn_on", r"(?:turn|switch)(?: it)? on|turn_on"),
-    ("turn_off", r"(?:turn|switch)(?: it)? off|turn_off"),
-    ("open", r"(?:slide |pull )?open"),
-    ("close", r"(?:push |slide )?closed?|(?:push )?shut"),
-    ("pick", r"pick(?: up)?|grab|grasp|lift(?: up)?|take|get|fetch"),
-    ("stack", r"stack"),
-    ("push", r"push|slide"),
-    ("put", r"put(?: down)?|place|set(?: down)?|drop|deposit|move|bring|transfer"),
-)
-_ANY_VERB = "|".join(pattern for _, pattern in _VERBS)
-_CLAUSES = re.compile(rf"(?:\s*,\s*|\s+)(?:and then|then|and)\s+(?=(?:{_ANY_VERB})\b)|\s*[,;]\s*(?=(?:{_ANY_VERB})\b)")
-# "turn the stove on" becomes "turn_on the stove".
-_SPLIT_VERB = re.compile(r"\b(?:turn|switch) ((?:the )?\w+(?: \w+)?) (on|off)\b(?=\s+(?:and|then)\b|\s*,|\s*$)")
-_DETERMINERS = frozenset(["the", "a", "an", "any", "both", "all", "two", "that", "this", "some"])
-
-
-def read_instruction(text: str) -> tuple[Action, ...]:
-    """The actions of an instruction, in order.
+def read_instruction(text: str, objects: Sequence[str] = ()) -> tuple[Action, ...]:
+    """The actions of an instruction, in the order in which they are to be done.
 
     Raises:
         NotUnderstood: a clause without a known verb, or with words left over.
     """
-    return _Reader().read([_clause(part) for part in _CLAUSES.split(spell(text))])
+    return understand(text, objects).actions
+
+
+def understand(text: str, objects: Sequence[str] = ()) -> Instruction:
+    """All that an instruction says: actions, and what is to be avoided, left alone or kept.
+
+    Args:
+        text: the instruction.
+        objects: names of the scene's objects.
+
+    Raises:
+        NotUnderstood: the message quotes what is not understood.
+    """
+    tokens = tokenize(text)
+    if len(tokens) > _MOST_WORDS:
+        raise NotUnderstood(f"{' '.join(tokens[:8])!r} ...: an instruction has at most {_MOST_WORDS} words")
+    clauses, speed = read_clauses(tokens)
+    if not clauses:
+        raise NotUnderstood(f"no known verb at the beginning of {text.strip()[:80]!r}")
+    return _Reader(read_names(objects)).read(clauses, speed)
 
 
 def read_noun(text: str) -> Noun:
-    """A noun phrase with its qualifiers: "the black bowl between the plate and the ramekin"."""
-    tokens = _Tokens(_tokens(spell(text)))
-    noun, phrases = tokens.group()
-    if noun is None or not tokens.at_end:
+    """A noun phrase with its qualifiers: "the black bowl between the plate and the ramekin".
+
+    Raises:
+        NotUnderstood: words that are no part of it.
+    """
+    cursor = Cursor(tokenize(text))
+    noun = read_noun_phrase(cursor)
+    if noun is not None:
+        phrases = read_phrases(cursor, inner=True)
+        noun = qualified(noun, phrases)
+        behind = Cursor(["the", "thing", *cursor.tokens[cursor.at :]])
+        more = read_noun_phrase(behind)
+        if more is not None and behind.at_end and not more.ranking and not more.relation:
+            noun = replace(noun, moved=(*noun.moved, *more.moved), excluded=(*noun.excluded, *more.excluded))
+            cursor.at = len(cursor.tokens)
+    if noun is None or not cursor.at_end:
         raise NotUnderstood(f"{text!r} cannot be parsed as a description of an object")
-    return _qualified(noun, phrases)
+    return noun
 
 
-def spell(text: str) -> str:
-    """An instruction in lower case, with spellings, possessives and colour pairs normalised."""
-    text = text.lower()
-    for pattern, replacement in _SPELLINGS:
-        text = re.sub(pattern, replacement, text)
-    return _SPLIT_VERB.sub(r"turn_\2 \1", " ".join(text.split()))
-
-
-def _relation_text(relation: Relation | None) -> str:
-    if relation is None:
-        return ""
-    refs = " and ".join(map(str, relation.refs))
-    return ("not " if relation.negated else "") + f"{_RELATION_WORDS.get(relation.kind, relation.kind)} {refs}"
-
-
-def _tokens(text: str) -> list[str]:
-    for pattern, replacement in _PREPOSITIONS:
-        text = re.sub(pattern, replacement, text)
-    return text.split()
-
-
-def _clause(text: str) -> tuple[str, list[str]]:
-    for verb, pattern in _VERBS:
-        found = re.match(rf"(?:{pattern})\b", text)
-        if found:
-            return verb, _tokens(text[found.end() :])
-    raise NotUnderstood(f"no known verb at the beginning of {text!r}")
-
-
-@dataclass(frozen=True)
-class _Phrase:
-    """A prepositional phrase; ``thing`` is None where the object is implied."""
-
-    kind: str
-    thing: Noun | None = None
-    second: Noun | None = None
-    negated: bool = False
-
-
-class _Tokens:
-    """A cursor over tokens. Lower-case tokens are words, the others prepositions and conjunctions."""
-
-    def __init__(self, tokens: Sequence[str]) -> None:
-        self._tokens, self._at = list(tokens), 0
-
-    @property
-    def at_end(self) -> bool:
-        return self._at == len(self._tokens)
-
-    def _next(self) -> str:
-        return "" if self.at_end else self._tokens[self._at]
-
-    def take(self, token: str) -> bool:
-        """Skip the next token if it is this one."""
-        found = self._next() == token
-        self._at += found
-        return found
-
-    def groups(self) -> list[tuple[Noun | None, list[_Phrase]]]:
-        """Noun phrases joined by "and", each with the prepositional phrases after it."""
-        found = [self.group()]
-        while self.take("AND"):
-            found.append(self.group())
-        if not self.at_end:
-            raise NotUnderstood(f"{' '.join(self._tokens[self._at :])!r} is not understood")
-        return found
-
-    def group(self) -> tuple[Noun | None, list[_Phrase]]:
-        """A noun phrase and the prepositional phrases after it."""
-        noun, phrases = self.noun(), []
-        while self._next() and self._next() not in {"AND", "OF"} and not self._next().islower():
-            phrases.append(self._phrase())
-        return noun, phrases
-
-    def noun(self) -> Noun | None:
-        """Parse determiner, words and "of ..."; None if there are no words."""
-        determiners, words = self._words(_DETERMINERS), self._words(None)
-        while self.take("OF"):
-            self._words(_DETERMINERS)
-            words = [*self._words(None), *words]
-        if not words:
-            return None
-        noun = Noun(
-            words=tuple(map(singular, words)),
-            plural=bool({"both", "all", "two"} & set(determiners))
-            or words[-1] == "them"
-            or words[-1] != singular(words[-1]),
-            indefinite=bool({"a", "an", "any", "some"} & set(determiners)),
-        )
-        return replace(noun, side=self._side())
-
-    def _words(self, only: frozenset[str] | None) -> list[str]:
-        found = []
-        while self._next() and self._next().islower() and (only is None or self._next() in only):
-            found.append(self._next())
-            self._at += 1
-        return found
-
-    def _side(self) -> str | None:
-        if not self._next().startswith("AT_"):
-            return None
-        side = self._next().removeprefix("AT_")
-        self._at += 1
-        return _SAME_SIDE.get(side, side)
-
-    def _phrase(self) -> _Phrase:
-        negated = self.take("NOT")
-        kind = self._next().lower()
-        self._at += 1
-        if kind not in {"between", *_PLACES, *_MODIFIERS}:
-            raise NotUnderstood(f"{kind!r} is not expected here")
-        thing = self.noun()
-        second = self.noun() if kind == "between" and self.take("AND") else None
-        if kind == "between" and second is None and not (thing and thing.plural):
-            raise NotUnderstood("'between' needs two objects")
-        return _Phrase(kind, thing, second, negated)
-
-
-_PLACES = frozenset(["on", "in", "top_of", "under", "near", "left_of", "right_of", "front_of", "back_of"])
-_MODIFIERS = frozenset(["from", "outside", "center", "between"])
-
-
-def _qualified(noun: Noun, phrases: Sequence[_Phrase]) -> Noun:
-    """A noun with its prepositional phrases nested as its relation."""
-    if not phrases:
-        return noun
-    first, *rest = phrases
-    if first.thing is None:
-        raise NotUnderstood(f"'{first.kind}' has no object")
-    thing = _qualified(first.thing, rest)
-    refs = (thing,) if first.second is None else (first.thing, _qualified(first.second, rest))
-    return replace(noun, relation=Relation(kind=first.kind, refs=refs, negated=first.negated))
+def read_between(text: str) -> tuple[Noun, Noun]:
+    """The two objects of "X and Y"."""
+    phrase = read_phrase(Cursor(["between", *tokenize(text)]))
+    if phrase is None or phrase.thing is None or phrase.second is None:
+        raise NotUnderstood(f"{text!r} cannot be parsed as two objects")
+    return phrase.thing, phrase.second
 
 
 class _Reader:
     """Turns clauses into actions; keeps the objects that pronouns and omitted objects can refer to."""
 
-    def __init__(self) -> None:
+    def __init__(self, names: Sequence[Name]) -> None:
+        self._names = names
         self._picked: list[Noun] = []
         self._moved: list[Noun] = []
         self._fixture: Noun | None = None
-        self._stacked: Action | None = None
-        self.actions: list[Action] = []
+        self._last: tuple[str, Place | None] = ("", None)
+        self._mentions: list[Noun] = []
+        self._places: list[Noun] = []
+        self._phrase: Phrase | None = None
+        self._put_on: Action | None = None
+        self._actions: list[tuple[float, Action]] = []
+        self._avoid: list[Avoidance] = []
+        self._untouched: list[Noun] = []
+        self._kept: list[tuple[str, Noun]] = []
+        self._forbidden: list[Action] = []
 
-    def read(self, clauses: Sequence[tuple[str, list[str]]]) -> tuple[Action, ...]:
-        for verb, tokens in clauses:
-            groups = _Tokens(tokens).groups()
-            if verb in {"put", "stack", "push"}:
-                self._put(verb, groups)
-            elif verb == "pick":
-                self._leave_picked()
-                self._picked = [_qualified(self._thing(noun), phrases) for noun, phrases in groups]
-            else:
-                self._operate(verb, groups)
-        self._leave_picked()
-        return tuple(self.actions)
+    def read(self, clauses: Sequence[Clause], speed: float | None) -> Instruction:
+        for clause in clauses:
+            self._clause(clause)
+        self._leave_picked(clauses[-1].when)
+        if not self._actions:
+            raise NotUnderstood(f"{clauses[0].said!r} says only what not to do")
+        ordered = sorted(self._actions, key=lambda pair: pair[0])
+        return Instruction(
+            actions=tuple(action for _, action in ordered),
+            avoid=tuple(self._avoid),
+            speed=speed,
+            untouched=tuple(self._untouched),
+            kept=tuple(self._kept),
+            forbidden=tuple(self._forbidden),
+        )
 
-    def _leave_picked(self) -> None:
+    # -- clauses -------------------------------------------------------------------------------------------------------
+
+    def _clause(self, clause: Clause) -> None:
+        if clause.forbidden:
+            self._forbid(clause)
+            return
+        verb = self._last[0] if clause.verb in {"again", "same"} else clause.verb
+        if not verb:
+            raise NotUnderstood(f"no known verb at the beginning of {clause.said!r}")
+        if verb == "avoid":
+            self._avoid += [Avoidance(thing=noun, cm=clause.cm) for noun in self._moved_described(clause.groups)]
+        elif verb == "untouched":
+            self._untouched += self._moved_described(clause.groups)
+        elif verb.startswith("keep_"):
+            self._kept += [(verb.removeprefix("keep_"), noun) for noun in self._described(clause.groups)]
+        elif verb in {"put", "stack", "push"}:
+            self._put(verb, clause)
+        elif verb == "pick":
+            self._leave_picked(clause.when)
+            self._fixture = self._moved[-1] if self._moved else self._fixture
+            self._picked = self._described(clause.groups)
+            self._rule_out(clause, self._picked)
+        else:
+            self._operate(verb, clause)
+        if verb in _VERBS:
+            self._last = (verb, self._last[1])
+
+    def _described(self, groups: Sequence[Group]) -> list[Noun]:
+        """Objects with all their phrases as their description."""
+        found = []
+        for noun, phrases in groups:
+            if noun is None:
+                raise NotUnderstood("the object is missing")
+            noun = self._resolved(qualified(noun, list(phrases))) if not noun.is_pronoun else self._thing(noun)
+            self._mention(noun)
+            found.append(noun)
+        return found
+
+    def _moved_described(self, groups: Sequence[Group]) -> list[Noun]:
+        """The same, where "it" is the object moved last rather than its place."""
+        fixture = self._fixture
+        self._fixture = (
+            [*([fixture] if fixture else []), *self._moved, *self._picked][-1:][0]
+            if fixture or self._moved or self._picked
+            else None
+        )
+        found = self._described(groups)
+        self._fixture = fixture
+        return found
+
+    def _forbid(self, clause: Clause) -> None:
+        """What must not be done; it is read by a reader of its own, which knows what this one knows."""
+        other = _Reader(self._names)
+        other._picked, other._moved, other._fixture = list(self._picked), list(self._moved), self._fixture
+        other._mentions, other._last = list(self._mentions), self._last
+        clause.forbidden = False
+        if clause.verb == "put" and not any(phrases for _, phrases in clause.groups):
+            self._untouched += self._moved_described(clause.groups)
+            return
+        other._clause(clause)
+        other._leave_picked(0.0)
+        self._mentions = other._mentions
+        self._forbidden += [action for _, action in other._actions]
+
+    def _leave_picked(self, when: float) -> None:
         """Objects picked up and not put anywhere stay in the hand."""
-        self.actions += [Action(verb="pick", thing=noun) for noun in self._picked]
+        self._actions += [(when, Action(verb="pick", thing=noun)) for noun in self._picked]
         self._picked = []
+
+    def _rule_out(self, clause: Clause, things: list[Noun]) -> None:
+        """ "the yellow book, not the black one": what is ruled out is not meant."""
+        for index, noun in enumerate(things):
+            out = [other for other in clause.ruled_out if isinstance(other, Noun)]
+            if out:
+                things[index] = replace(
+                    noun, excluded=(*noun.excluded, *(self._headed(other, [noun]) for other in out))
+                )
+
+    # -- what is meant -------------------------------------------------------------------------------------------------
+
+    def _mention(self, noun: Noun) -> None:
+        for part in _inner(noun):
+            if part not in self._mentions[-1:]:
+                self._mentions.append(part)
 
     def _thing(self, noun: Noun | None) -> Noun:
+        """What a pronoun or an omitted object stands for."""
         if noun is not None and not noun.is_pronoun:
-            return noun
+            return self._resolved(noun)
+        word = noun.words[0] if noun else ""
+        if word in {"itself", "themselves"}:
+            raise NotUnderstood(f"{word!r}: nothing can be put on or in {word}")
         if self._fixture is None:
-            raise NotUnderstood(f"{'the pronoun' if noun else 'the omitted object'} refers to nothing")
+            raise NotUnderstood(
+                f"{word!r} refers to nothing said before" if noun else "the omitted object refers to nothing"
+            )
         return self._fixture
 
-    def _operate(self, verb: str, groups: Sequence[tuple[Noun | None, list[_Phrase]]]) -> None:
-        for noun, phrases in groups:
-            self._fixture = _qualified(self._thing(noun), phrases)
-            self.actions.append(Action(verb=verb, thing=self._fixture))
+    def _said(self, as_place: bool) -> list[Noun]:
+        """The objects named so far, the latest first; places last where an object to act on is meant."""
+        things = [noun for noun in self._mentions[::-1] if as_place or noun not in self._places]
+        return [*things, *self._places[::-1]]
 
-    def _put(self, verb: str, groups: Sequence[tuple[Noun | None, list[_Phrase]]]) -> None:
+    def _resolved(self, noun: Noun, it: Noun | None = None, *, as_place: bool = False) -> Noun:
+        """A description with "one", "other", "that ..." and the pronouns inside it resolved.
+
+        Args:
+            noun: the description.
+            it: what "it" inside the description stands for; by default the last object that was moved or operated.
+            as_place: whether it says where to put something.
+        """
+        if noun.words[-1] in {"one", "ones"} and not noun.is_pronoun:
+            noun = self._headed(noun, [*(self._places[::-1] if as_place else ()), *self._said(as_place)])
+        if noun.said and noun.is_bare:
+            same = [mention for mention in self._mentions if mention.words[-1] == noun.words[-1]]
+            return same[-1] if same else replace(noun, said=False)
+        if noun.other:
+            before = [mention for mention in self._mentions if mention.words[-1] == noun.words[-1]]
+            if not before:
+                raise NotUnderstood(f"{str(noun)!r}: other than which?")
+            own = tuple(dict.fromkeys(replace(mention, plural=False) for mention in before))
+            noun = replace(noun, other=False, excluded=(*noun.excluded, *own))
+        if noun.is_bare and not noun.plural and not noun.indefinite:
+            noun = self._recent(noun)
+        return self._inside(noun, it)
+
+    def _recent(self, noun: Noun) -> Noun:
+        """ "The drawer" where one of several was named before: that one. Only of what is not put somewhere."""
+        if not self._names or not matching(noun.words, self._names):
+            return noun
+        try:
+            ground(noun, self._names)
+        except NotUnderstood:
+            fits = {name.text for name in matching(noun.words, self._names)}
+            candidates = [*self._picked, *self._mentions]
+            for mention in reversed(candidates):
+                known = {name.text for name in matching(mention.words, self._names)}
+                if known < fits and (all(name.is_part for name in matching(mention.words, self._names))):
+                    return mention
+        return noun
+
+    def _inside(self, noun: Noun, it: Noun | None) -> Noun:
+        """The objects that a description refers to, resolved."""
+
+        def one(ref: Noun) -> Noun:
+            if ref.words[-1] in {"one", "ones"} and not ref.is_pronoun:
+                ref = self._headed(ref, [noun, *self._mentions[::-1]])
+            if not ref.is_pronoun:
+                return self._resolved(ref, it)
+            return it if it is not None else self._antecedent(ref)
+
+        if noun.ranking is not None and noun.ranking.ref is not None:
+            noun = replace(noun, ranking=replace(noun.ranking, ref=one(noun.ranking.ref)))
+        if noun.relation is not None:
+            noun = replace(noun, relation=replace(noun.relation, refs=tuple(map(one, noun.relation.refs))))
+        return noun
+
+    def _antecedent(self, pronoun: Noun) -> Noun:
+        known = [*self._moved[-1:], *([self._fixture] if self._fixture else []), *self._picked[-1:]]
+        if not known:
+            raise NotUnderstood(f"{pronoun.words[0]!r} refers to nothing said before")
+        return known[-1]
+
+    def _headed(self, noun: Noun, mentions: Sequence[Noun]) -> Noun:
+        """ "The red one": with the noun of an earlier object in place of "one", the latest that makes sense."""
+        if noun.words[-1] not in {"one", "ones"}:
+            return noun
+        own = set(noun.words[:-1])
+        heads = [_described_words(mention, own) for mention in mentions if not is_table(mention)]
+        heads += [mention.words[-1:] for mention in mentions if not is_table(mention)]
+        for head in dict.fromkeys(heads):
+            option = replace(noun, words=(*noun.words[:-1], *head))
+            if not self._names or self._fits(option):
+                return option
+        if not heads:
+            raise NotUnderstood(f"{str(noun)!r}: one of what?")
+        return replace(noun, words=(*noun.words[:-1], *heads[-1]))
+
+    def _fits(self, noun: Noun) -> bool:
+        try:
+            ground(replace(noun, other=False, plural=True, number=None) if noun.other else noun, self._names)
+        except NotUnderstood:
+            return False
+        return True
+
+    # -- opening, closing, turning -------------------------------------------------------------------------------------
+
+    def _operate(self, verb: str, clause: Clause) -> None:
+        for noun, phrases in clause.groups:
+            thing = self._thing(noun) if noun is None or noun.is_pronoun else self._resolved(qualified(noun, phrases))
+            self._mention(thing)
+            things = [thing]
+            self._rule_out(clause, things)
+            self._fixture = thing
+            self._actions.append((clause.when, Action(verb=verb, thing=things[0])))
+
+    # -- putting -------------------------------------------------------------------------------------------------------
+
+    def _put(self, verb: str, clause: Clause) -> None:
+        groups = [group for group in clause.groups if group != (None, [])] or clause.groups
+        if any(noun is None and phrases for noun, phrases in groups[1:]):
+            raise NotUnderstood(f"{clause.groups[0][0]} cannot be at two places: {clause.said!r}")
         placed: list[Action] = []
-        for noun, phrases in reversed(groups):
-            nouns, place = self._moving(noun), self._place(phrases, placed)
-            for one in reversed(nouns):
-                thing = _qualified(one, phrases[:-1]) if place is not None else _qualified(one, phrases)
-                placed.insert(0, Action(verb="push" if verb == "push" else "put", thing=thing, place=place))
-        self._add([self._completed(action, placed, index) for index, action in enumerate(placed)], verb)
+        for index, (noun, phrases) in enumerate(groups):
+            place, describing = self._split(noun, phrases, groups[index + 1 :], clause)
+            for thing in self._moving(noun, describing):
+                self._mention(thing)
+                placed.append(self._action(verb, thing, place, clause, placed))
+        self._check_ruled_out(clause, placed)
+        self._add(placed, verb, clause.when)
 
-    def _moving(self, noun: Noun | None) -> list[Noun]:
+    def _split(
+        self, noun: Noun | None, phrases: Sequence[Phrase], later: Sequence[Group], clause: Clause
+    ) -> tuple[Phrase | None, list[Phrase]]:
+        """The phrase that says where to, and those that describe the object.
+
+        The last phrase says where to; of an object without one, that of the next object ("put A and B in the basket").
+        A last phrase such as "to its left" describes the object of the phrase before it.
+        """
+        if clause.way or (not phrases and not later):
+            return None, list(phrases)
+        if not phrases:
+            return next((group[1][-1] for group in later if group[1]), None), []
+        *before, last = phrases
+        if before and last.kind in BESIDE and last.thing is not None and last.thing.is_pronoun and before[-1].thing:
+            *before, last = [*before[:-1], replace(before[-1], thing=qualified(before[-1].thing, [last]))]
+        sources = [phrase for phrase in before if phrase.kind in PLACES and phrase.kind in {"to", "towards"}]
+        if sources:
+            raise NotUnderstood(f"{str(noun)!r} cannot be at two places: {clause.said!r}")
+        if last.kind == "from" and before:
+            *before, last = [*before[:-1], last, before[-1]]
+        return last, before
+
+    def _moving(self, noun: Noun | None, describing: list[Phrase]) -> list[Noun]:
         """The objects to put: the noun's, else those picked up, else those put somewhere before."""
         if noun is not None and not noun.is_pronoun:
-            return [noun]
+            return [self._resolved(qualified(noun, describing))]
+        word = noun.words[0] if noun else ""
+        if word in {"itself", "themselves", "there", "one", "each other"}:
+            raise NotUnderstood(f"{word!r} refers to nothing said before")
+        both = word in {"them", "they", "these", "those"}
+        if both and not self._picked and len(self._moved) == 1 and self._put_on and self._put_on.place:
+            # "Put A in B and put them in C": B goes to C first, then A to B again; a stack is not carried.
+            return [self._put_on.place.thing, self._moved[0]]
         moving = self._picked or self._moved
         if not moving:
-            raise NotUnderstood("the object to put there is missing")
+            missing = f"{word!r} refers to nothing: " if noun else ""
+            raise NotUnderstood(f"{missing}the object to put there is missing")
         self._picked = []
-        return moving
+        return list(moving)
 
-    def _place(self, phrases: Sequence[_Phrase], later: Sequence[Action]) -> Place | None:
-        """The last phrase, or the destination of the next object ("put A and B in the basket")."""
-        if not phrases:
-            return later[0].place if later else None
-        last = phrases[-1]
-        if last.kind not in _PLACES or last.negated:
-            raise NotUnderstood(f"'{last.kind}' is not a destination")
-        omitted = Noun(words=("it",))
-        return Place(relation=last.kind, thing=last.thing or omitted)
-
-    def _completed(self, action: Action, placed: Sequence[Action], index: int) -> Action:
-        """The action with a pronoun or omitted object in its destination resolved."""
-        place = action.place
+    def _action(self, verb: str, thing: Noun, phrase: Phrase | None, clause: Clause, placed: list[Action]) -> Action:
+        if clause.way:
+            if not clause.cm:
+                raise NotUnderstood(f"how far to the {clause.way} is {thing} to go?")
+            return Action(verb="shift", thing=thing, way=clause.way, cm=clause.cm)
+        place = self._place(phrase, thing, placed, clause)
+        if place is None and verb == "stack" and thing.plural:
+            return Action(verb="stack", thing=thing)
         if place is None:
-            raise NotUnderstood(f"the destination of {action.thing} is missing")
-        if not place.thing.is_pronoun:
-            return action
-        before = placed[index - 1].place if index else None
-        return replace(action, place=replace(place, thing=before.thing if before else self._thing(None)))
+            raise NotUnderstood(f"the destination of {thing} is missing")
+        return Action(verb="push" if verb == "push" else "put", thing=thing, place=place)
 
-    def _add(self, actions: Sequence[Action], verb: str) -> None:
-        if self._stacked and [action.thing for action in actions] == self._moved:
-            actions = self._carried_stack(self._stacked, actions[0])
-            self.actions.remove(self._stacked)
-        self._stacked = actions[0] if verb == "stack" else None
+    def _place(self, phrase: Phrase | None, thing: Noun, placed: list[Action], clause: Clause) -> Place | None:
+        if phrase is None:
+            before = placed[-1].place if placed else None
+            if before is not None and before.thing.words[-1:] == thing.words[-1:]:
+                raise NotUnderstood(f"is {thing} to be moved too, or another place? {clause.said!r}")
+            return self._last[1] if clause.verb in {"again", "same"} else before
+        if phrase.thing is None and phrase.kind in BESIDE and not (placed and placed[-1].place):
+            raise NotUnderstood(f"how far {phrase.said!r} is {thing} to go?")
+        if phrase.kind == "there":
+            if self._last[1] is None:
+                raise NotUnderstood("'there' refers to nothing said before")
+            return self._last[1]
+        if phrase.kind not in PLACES or phrase.negated:
+            raise NotUnderstood(f"'{phrase.said or phrase.kind}' is not a destination")
+        second = self._resolved(phrase.second, thing) if phrase.second else None
+        target = self._place_thing(phrase, thing, placed, clause)
+        self._phrase = phrase
+        self._mention(target)
+        self._places.append(target)
+        return Place(relation=phrase.kind, thing=target, second=second, cm=phrase.cm)
+
+    def _place_thing(self, phrase: Phrase, thing: Noun, placed: list[Action], clause: Clause) -> Noun:
+        """The object of a destination; "it" is what describes the object, or the last place or fixture."""
+        noun = phrase.thing
+        if noun is not None and not noun.is_pronoun:
+            return self._resolved(noun, thing, as_place=True)
+        if noun is not None and noun.words[0] == "each other":
+            return noun
+        if noun is None or noun.words[0] in {"it", "that", "this"}:
+            if noun is not None and len(inner := _inner(thing)) > 1:
+                return inner[-2]
+            before = placed[-1].place if placed else self._last[1] if clause.verb == "again" else None
+            if before is not None and phrase is self._phrase:
+                return before.thing
+            last = self._moved_last(placed)
+            bearing = {"on", "top_of", "in"} if last is not None and last.words[-1] in _BEARERS else set()
+            where = before.relation if before else self._last[1].relation if self._last[1] else ""
+            if (
+                noun is not None
+                and where in bearing
+                and phrase.kind in bearing - ({"top_of"} if where == "in" else set())
+            ):
+                raise NotUnderstood(f"'{phrase.said} {noun.words[0]}' could be {last} or what it is put on or in")
+            if before is not None:
+                return before.thing
+            if self._fixture is None and self._mentions[:-1] and noun is not None:
+                return self._mentions[-2]
+        return self._thing(noun if noun is not None else None)
+
+    def _moved_last(self, placed: Sequence[Action]) -> Noun | None:
+        return placed[-1].thing if placed else self._moved[-1] if self._moved else None
+
+    def _check_ruled_out(self, clause: Clause, placed: list[Action]) -> None:
+        """ ", not on the right plate": it must be another place than the one that is said."""
+        for out in clause.ruled_out:
+            if isinstance(out, Phrase) and out.thing is not None and out.kind in PLACES:
+                noun = self._headed(out.thing, [action.place.thing for action in placed if action.place])
+                if any(
+                    action.place and action.place.thing == noun and out.kind == action.place.relation
+                    for action in placed
+                ):
+                    raise NotUnderstood(f"{clause.said!r} is ruled out by 'not {out.said} {noun}'")
+            elif isinstance(out, Noun):
+                things = [action.thing for action in placed]
+                self._rule_out(clause, things)
+                placed[:] = [replace(action, thing=thing) for action, thing in zip(placed, things, strict=True)]
+
+    def _add(self, actions: list[Action], verb: str, when: float) -> None:
+        stack, self._put_on = self._put_on, None
+        if stack is not None and stack.place is not None and [action.thing for action in actions] in _carrying(stack):
+            carry = replace(actions[0], thing=stack.place.thing)
+            self._actions = [(at, action) for at, action in self._actions if action is not stack]
+            actions = [carry, stack]
+        elif len(actions) == 1 and actions[0].verb == "put":
+            self._put_on = actions[0]
+        del verb
         self._moved = [action.thing for action in actions]
-        self._fixture = actions[-1].place.thing if actions[-1].place else self._fixture
-        self.actions += actions
-
-    @staticmethod
-    def _carried_stack(stack: Action, carry: Action) -> list[Action]:
-        """ "Stack A on B and put them in C": B goes to C first, then A onto B; a stack is not carried."""
-        assert stack.place is not None
-        return [replace(carry, thing=stack.place.thing), stack]
+        places = [action.place for action in actions if action.place]
+        if places:
+            self._last = (self._last[0], places[-1])
+            self._fixture = places[-1].thing
+        self._actions += [(when, action) for action in actions]
 
 
-def split_side(words: Sequence[str]) -> tuple[tuple[str, ...], str | None]:
-    """Words without the one that selects among equals, and that word: ("middle", "bowl") -> ("bowl",), "middle"."""
-    for word in words:
-        if word in SIDES and len(words) > 1:
-            return tuple(other for other in words if other != word), _SAME_SIDE.get(word, word)
-    return tuple(words), None
+_VERBS = frozenset(words("put stack push pick open close turn_on turn_off"))
+
+
+# Things that others can stand in or on.
+_BEARERS = frozenset(
+    words("plate bowl tray basket towel cloth book block cube box ramekin mug cup pan frypan caddy cookie")
+)
+
+
+def _described_words(noun: Noun, own: set[str]) -> tuple[str, ...]:
+    """What "one" repeats of an earlier description: all but its side and size, and its colour where another is said."""
+    dropped = {*SIDE_WORDS, *SIZES, *(COLOURS if own & COLOURS else ())}
+    return tuple(word for word in noun.words if word not in dropped) or noun.words[-1:]
+
+
+def _carrying(stack: Action) -> list[list[Noun]]:
+    """The objects of an action that carries a stack: both of them."""
+    assert stack.place is not None
+    return [[stack.place.thing, stack.thing]]
+
+
+def _inner(noun: Noun) -> list[Noun]:
+    """The objects that a description names, the described one last."""
+    refs: list[Noun] = []
+    if noun.relation is not None:
+        refs += noun.relation.refs
+    if noun.ranking is not None and noun.ranking.ref is not None:
+        refs.append(noun.ranking.ref)
+    return [*(part for ref in refs for part in _inner(ref)), noun]
+
+
+__all__ = ["Noun", "Ranking", "Relation", "read_between", "read_instruction", "read_noun", "understand"]

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import re
 
-from voxposer.offline.rules import BESIDE, CM, SIDES, THING, Groups, Rules, Writer, choose, get, variable
+from voxposer.offline.grammar import read_between
+from voxposer.offline.rules import BESIDE, CM, GAP, SIDES, THING, Groups, Rules, Writer, choose, get, variable
 
 # Distance between objects that are put next to each other, centimetres.
 ROOM = 2
@@ -71,9 +72,35 @@ def _beside_for(match: Groups) -> list[str]:
     ]
     if not held:
         return [*lines, "z = moved.position[2]"]
-    height = f" + cm2index({match['cm']}, 'z')" if match["cm"] else ""
+    return [*lines, *_hand_over(match["cm"])]
+
+
+def _between_for(match: Groups) -> list[str]:
+    """On the table in the middle of two objects, for the held one."""
+    first, second = map(str, read_between(match["thing"]))
     return [
-        *lines,
+        get(first, "first"),
+        get(second, "second"),
+        get("held object", "held"),
+        "x, y, z = (first.position + second.position) / 2",
+        *_hand_over(match["cm"]),
+    ]
+
+
+def _center_for(match: Groups) -> list[str]:
+    """On the table in the middle of it, for the held object."""
+    return [
+        get(match["thing"], "thing"),
+        get("held object", "held"),
+        "x, y, z = thing.position",
+        *_hand_over(match["cm"]),
+    ]
+
+
+def _hand_over(cm: str) -> list[str]:
+    """From the middle of the held object at x, y to the hand, on the table or above it."""
+    height = f" + cm2index({cm}, 'z')" if cm else ""
+    return [
         "table = parse_query_obj('table')",
         "# the underside of the held object goes there, the hand is above it",
         "x = x + held.hand_offset[0]",
@@ -143,9 +170,11 @@ _POINTS: Rules = (
         _along,
     ),
     (
-        rf"a point (?:{CM} above|on) the table (?P<side>{BESIDE}) {THING} for (?P<moved>the held object)(?P<room>)",
+        rf"a point (?:{CM} above|on) the table {GAP}(?P<side>{BESIDE}) {THING} for (?P<moved>the held object)",
         _beside_for,
     ),
+    (rf"a point (?:{CM} above|on) the table between {THING} for the held object", _between_for),
+    (rf"a point (?:{CM} above|on) the table at the center of {THING} for the held object", _center_for),
     (
         rf"a point (?P<room>\d+) ?cm (?P<side>{BESIDE}|towards) {THING} for (?P<moved>.+?)(?P<cm>)",
         _beside_for,

@@ -29,7 +29,7 @@ _MAKES = _words("wine wooden wood flat desk coffee akita porcelain glazed rim ki
 # Word in a name -> other words that an instruction may use for it.
 _SENSES = {
     "porcelain": ("white",),
-    "cookie": ("box", "biscuit"),
+    "cookie": ("box", "biscuit", "food"),
     "frypan": ("pan", "skillet"),
     "mug": ("cup",),
     "cup": ("mug",),
@@ -37,7 +37,6 @@ _SENSES = {
     "caddy": ("organizer", "organiser"),
     "cabinet": ("cupboard",),
     "stove": ("stovetop", "hob"),
-    "bbq": ("barbecue",),
     "block": ("cube",),
     "cube": ("block",),
     "cloth": ("towel",),
@@ -49,9 +48,31 @@ _SENSES = {
     "level": ("shelf",),
     "upper": ("top",),
     "lower": ("bottom",),
+    # What they are packed in, or are.
+    "soup": ("can", "tin", "food"),
+    "tomato": ("can", "tin", "food"),
+    "ketchup": ("bottle", "sauce", "food"),
+    "bbq": ("barbecue", "bottle", "food"),
+    "dressing": ("bottle", "food"),
+    "milk": ("carton", "drink", "food"),
+    "juice": ("carton", "drink", "food"),
+    "cheese": ("box", "food"),
+    "butter": ("box", "food"),
+    "pudding": ("box", "dessert", "food"),
+    "apple": ("fruit", "food"),
+    "orange": ("fruit", "food"),
+    "banana": ("fruit", "food"),
+    "carrot": ("vegetable", "food"),
+    "eggplant": ("vegetable", "aubergine", "food"),
+    "coke": ("cola", "drink"),
+    "pepsi": ("cola", "drink"),
+    "7up": ("drink",),
+    "sprite": ("drink",),
+    "fanta": ("drink",),
+    "redbull": ("drink",),
 }
 _IRREGULAR = {"shelves": "shelf", "knives": "knife", "boxes": "box", "dishes": "dish", "glasses": "glass"}
-_NOT_PLURAL = _words("gas glass less plus lens alias")
+_NOT_PLURAL = _words("gas glass less plus lens alias themselves")
 
 
 class NotUnderstood(InvalidInput):

@@ -9,23 +9,30 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
-from voxposer.offline.grammar import Noun, Relation, read_noun
+from voxposer.offline.grammar import read_noun
+from voxposer.offline.grounding import Found, ground, holder, is_table, refs_of
+from voxposer.offline.meaning import Noun, Ranking, Relation
 from voxposer.offline.names import Name, NotUnderstood, read_names
-from voxposer.offline.planner_writer import Found, ground, holder
 from voxposer.offline.rules import variable
 
 _HANDS = frozenset(["gripper", "hand", "ee", "end effector", "end_effector", "endeffector"])
 _TABLES = frozenset(["table", "workspace", "work space", "desk", "floor"])
 _HELD = frozenset(["held object", "object in the gripper", "it"])
-# Which candidate a side means: the extreme of which coordinate.
-_SIDES = {
-    "left": ("argmin", 1),
-    "right": ("argmax", 1),
-    "back": ("argmin", 0),
-    "front": ("argmax", 0),
-    "bottom": ("argmin", 2),
-    "top": ("argmax", 2),
+# The extreme of which value is meant: whether the least, and the value.
+_VALUES = {
+    "left": (True, "thing.position[1]"),
+    "right": (False, "thing.position[1]"),
+    "back": (True, "thing.position[0]"),
+    "front": (False, "thing.position[0]"),
+    "bottom": (True, "thing.position[2]"),
+    "top": (False, "thing.position[2]"),
+    "small": (True, "np.prod((thing.aabb[1] - thing.aabb[0] + 1) * cm)"),
+    "large": (False, "np.prod((thing.aabb[1] - thing.aabb[0] + 1) * cm)"),
+    "short": (True, "thing.aabb[1][2] - thing.aabb[0][2]"),
+    "tall": (False, "thing.aabb[1][2] - thing.aabb[0][2]"),
+    "long": (False, "np.max((thing.aabb[1] - thing.aabb[0]) * cm)"),
 }
 _CONTAINERS = frozenset(["drawer", "compartment", "inside", "basket", "tray", "microwave", "caddy"])
 _BESIDE = {"left_of": ("<", 1), "right_of": (">", 1), "back_of": ("<", 0), "front_of": (">", 0)}
@@ -47,7 +54,10 @@ def write_query(query: str, objects: Sequence[str]) -> str:
     for alias, known in (("gripper", _HANDS), ("table", _TABLES), ("held object", _HELD)):
         if bare in known and not any(name.text.lower() == bare for name in names):
             return f"ret_val = detect({alias!r})"
-    lines, found = _Locator(names).locate(read_noun(text))
+    try:
+        lines, found = _Locator(names).locate(read_noun(text))
+    except RecursionError:
+        raise NotUnderstood(f"{text[:80]!r} describes objects by one another without an end") from None
     return "\n".join([*lines, f"ret_val = {found}"])
 
 
@@ -56,7 +66,21 @@ class _Locator:
 
     def __init__(self, names: Sequence[Name]) -> None:
         self._names = names
-        self._used: set[str] = {"cm", "distances", "face", "foot", "gap", "high", "low", "middle", "thing"}
+        self._scaled = False
+        self._used: set[str] = {
+            "cm",
+            "distances",
+            "face",
+            "objects",
+            "np",
+            "i",
+            "foot",
+            "gap",
+            "high",
+            "low",
+            "middle",
+            "thing",
+        }
 
     def locate(self, noun: Noun, inside: str = "") -> tuple[list[str], str]:
         """Lines, and the expression that holds the object after them.
@@ -65,36 +89,89 @@ class _Locator:
             noun: what to find.
             inside: a relation; the part of the object that holds its contents is meant.
         """
-        if noun.words == ("table",):
+        if is_table(noun):
             return [], "detect('table')"
         found = ground(noun, self._names)
         if found.is_settled:
             name = found.names[0]
             return [], f"detect({((inside and holder(inside, name, self._names)) or name).text!r})"
         listed = ", ".join(repr(name.text) for name in found.names)
-        if found.noun.plural and not (found.noun.side or found.noun.relation):
+        chosen = found.noun.ranking or found.noun.relation or found.noun.excluded or found.noun.moved
+        if found.noun.plural and not chosen:
             return [], f"[detect(name) for name in [{listed}]]"
         several = self._name(variable(" ".join(found.noun.words)) + "s")
         lines = [f"{several} = [detect(name) for name in [{listed}]]"]
-        more, chosen = self._choose(found, several)
-        return [*lines, *more], chosen
+        more, expression = self._choose(found, several)
+        return [*lines, *more], expression
 
     def _name(self, wish: str) -> str:
         name = next(name for name in (wish, *(f"{wish}_{i}" for i in range(2, 99))) if name not in self._used)
         self._used.add(name)
         return name
 
+    def _scale(self) -> list[str]:
+        """The line that says how large voxels are, the first time it is needed."""
+        needed, self._scaled = not self._scaled, True
+        return [_SCALE] if needed else []
+
     def _choose(self, found: Found, several: str) -> tuple[list[str], str]:
         noun = found.noun
-        if noun.side and noun.relation:
-            raise NotUnderstood(f"{str(noun)!r} says both a side and a relation; say one")
-        if noun.relation:
-            return self._by_relation(noun.relation, several)
-        if noun.side == "middle":
-            lines = [_SCALE, f"middle = sum([thing.position for thing in {several}]) / len({several})"]
+        lines, left = [], len(found.names)
+        for count, relation in noun.moved:
+            lines += self._without_moved(count, relation, several)
+            left -= count
+        for excluded in noun.excluded:
+            lines += self._without(excluded, several)
+            left -= 1
+        for ref in refs_of(noun):
+            if not is_table(ref) and _could_be(ground(ref, self._names), found):
+                lines += self._without(replace(ref, plural=False), several)
+        if noun.relation and noun.ranking and noun.relation.kind not in _BESIDE:
+            raise NotUnderstood(f"{str(noun)!r} says both an order and a place; say one")
+        if noun.relation and noun.ranking:
+            more, several = self._beyond(noun.relation, several)
+            lines += more
+        elif noun.relation:
+            more, expression = self._by_relation(noun.relation, several)
+            return [*lines, *more], expression
+        if noun.ranking:
+            more, expression = self._ranked(noun.ranking, several)
+            return [*lines, *more], expression
+        if left != 1 and not noun.indefinite:
+            raise NotUnderstood(f"{str(noun)!r} could be any of {left}")
+        return lines, f"{several}[0]"
+
+    def _ranked(self, ranking: Ranking, several: str) -> tuple[list[str], str]:
+        """The one at a rank of an order."""
+        if ranking.key == "middle":
+            if ranking.rank != 1:
+                raise NotUnderstood("only one is in the middle")
+            lines = [*self._scale(), f"middle = sum([thing.position for thing in {several}]) / len({several})"]
             return [*lines, _distances(several, "middle")], f"{several}[np.argmin(distances)]"
-        function, axis = _SIDES[noun.side or ""]
-        return [], f"{several}[np.{function}([thing.position[{axis}] for thing in {several}])]"
+        if ranking.key in {"near", "far"}:
+            assert ranking.ref is not None
+            lines, goal = self._goal(Relation(kind="near", refs=(ranking.ref,)))
+            lines += [*self._scale(), _distances(several, goal, flat=True)]
+            return lines, f"{several}[{_at('distances', ranking.key == 'near', ranking.rank)}]"
+        least, value = _VALUES[ranking.key]
+        values = f"[{value} for thing in {several}]"
+        return (self._scale() if "cm" in value else []), f"{several}[{_at(values, least, ranking.rank)}]"
+
+    def _without_moved(self, count: int, relation: Relation, several: str) -> list[str]:
+        """Lines that leave out those that are where others were put."""
+        if relation.refs[0].words == ("hand",):
+            return [f"{several} = [thing for thing in {several} if not thing.held]"]
+        lines, goal = self._goal(relation)
+        flat = relation.kind not in {"on", "in", "top_of", "under"}
+        lines += [*self._scale(), _distances(several, goal, flat=flat)]
+        return [*lines, f"{several} = [{several}[i] for i in np.argsort(distances)[{count}:]]"]
+
+    def _without(self, excluded: Noun, several: str) -> list[str]:
+        """Lines that leave out one that is described."""
+        lines, expression = self.locate(excluded)
+        name = self._name("excluded")
+        kept = f"[thing for thing in {several} if thing.name != {name}.name]"
+        return [*lines, f"{name} = {expression}", f"{several} = {kept}"]
 
     def _by_relation(self, relation: Relation, several: str) -> tuple[list[str], str]:
         if relation.kind in _BESIDE:
@@ -102,9 +179,9 @@ class _Locator:
         lines, goal = self._goal(relation)
         away = relation.negated != (relation.kind == "outside")
         if _is_on(relation):
-            lines += [_SCALE, *_gaps(several, goal.removesuffix(".position"))]
+            lines += [*self._scale(), *_gaps(several, goal.removesuffix(".position"))]
         else:
-            lines += [_SCALE, _distances(several, goal, flat=relation.kind in _FLAT)]
+            lines += [*self._scale(), _distances(several, goal, flat=relation.kind in _FLAT)]
         return lines, f"{several}[np.{'argmax' if away else 'argmin'}(distances)]"
 
     def _goal(self, relation: Relation) -> tuple[list[str], str]:
@@ -125,12 +202,34 @@ class _Locator:
     def _beside(self, relation: Relation, several: str) -> tuple[list[str], str]:
         """The closest one on one side of an object."""
         lines, goal = self._goal(relation)
+        lines, candidates = self._filtered(relation, several, lines, goal)
+        lines += [*self._scale(), _distances(candidates, goal)]
+        return lines, f"{candidates}[np.argmin(distances)] if len({candidates}) > 0 else None"
+
+    def _beyond(self, relation: Relation, several: str) -> tuple[list[str], str]:
+        """Those on one side of an object."""
+        lines, goal = self._goal(relation)
+        return self._filtered(relation, several, lines, goal)
+
+    def _filtered(self, relation: Relation, several: str, lines: list[str], goal: str) -> tuple[list[str], str]:
         sign, axis = _BESIDE[relation.kind]
         condition = f"thing.position[{axis}] {sign} {goal}[{axis}]"
         chosen = f"[thing for thing in {several} if {'not ' if relation.negated else ''}{condition}]"
         candidates = self._name("candidates")
-        lines += [f"{candidates} = {chosen}", _SCALE, _distances(candidates, goal)]
-        return lines, f"{candidates}[np.argmin(distances)]"
+        return [*lines, f"{candidates} = {chosen}"], candidates
+
+
+def _could_be(ref: Found, found: Found) -> bool:
+    """Whether an object that describes another could be that one, so that it must be left out when the program runs."""
+    return not ref.is_settled and not ref.noun.plural and bool(set(ref.names) & set(found.names))
+
+
+def _at(values: str, least: bool, rank: int) -> str:
+    """The index of the element at a rank, counted from the least or the greatest value."""
+    if abs(rank) == 1:
+        return f"np.{'argmin' if least == (rank > 0) else 'argmax'}({values})"
+    place = rank - 1 if (rank > 0) == least else -rank
+    return f"np.argsort({values})[{place}]"
 
 
 def _is_on(relation: Relation) -> bool:

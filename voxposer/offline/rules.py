@@ -30,9 +30,30 @@ SIDES = {
     "on top of": ("z", 1),
     "below": ("z", -1),
 }
+# Before a side: the gap to leave, where it is not the usual one.
+GAP = r"(?:(?P<room>\d+(?:\.\d+)?) ?cm )?"
 BESIDE = "to the right of|to the left of|to the front of|in front of|to the back of|behind|next to"
-_QUALIFIED = re.compile(r"\s(?:on|in|at|to|next|between|behind|under|not|from|outside)\b")
-_TAKEN = frozenset(["held", "moved", "beside", "movable", "thing", "turn", "half", "x", "y", "z"])
+_QUALIFIED = re.compile(
+    r"\s(?:on|in|at|to|next|between|behind|under|not|from|outside|besides|except|nearest|farthest)\b"
+)
+_TAKEN = frozenset(
+    [
+        "held",
+        "moved",
+        "beside",
+        "excluded",
+        "candidate",
+        "first",
+        "second",
+        "movable",
+        "thing",
+        "turn",
+        "half",
+        "x",
+        "y",
+        "z",
+    ]
+)
 
 
 def choose(rules: Rules, query: str, lmp: str) -> str:

@@ -1,0 +1,182 @@
+"""The offline writer on ordinary sentences: the set with its expected outcomes, and any text at all."""
+
+from __future__ import annotations
+
+import ast
+import collections
+import contextlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.sentences import HALVES, Sentence, judge, load, snapshots
+
+from voxposer.offline.grammar import read_noun, understand
+from voxposer.offline.names import NotUnderstood
+from voxposer.offline.planner_writer import write_planner
+
+SENTENCES = load()
+NAMES = [
+    *("akita_black_bowl_1", "akita_black_bowl_2", "plate_1", "wine_bottle_1", "wooden_cabinet_1"),
+    *(f"wooden_cabinet_1_{level}_{part}" for level in ("top", "middle", "bottom") for part in ("drawer", "handle")),
+    *("wooden_cabinet_1_top", "flat_stove_1", "flat_stove_1_knob", "flat_stove_1_burner"),
+]
+# Words to make sentences of that are nearly understood.
+WORDS = sorted({word for sentence in SENTENCES for word in sentence.say.lower().replace(",", " ,").split()})
+
+
+def test_the_set_has_both_halves_and_every_scene() -> None:
+    halves = collections.Counter(sentence.half for sentence in SENTENCES)
+    assert len(SENTENCES) >= 200
+    assert all(halves[half] >= 90 for half in HALVES)
+    assert {sentence.scene for sentence in SENTENCES} == set(snapshots())
+    assert len({(sentence.scene, sentence.say) for sentence in SENTENCES}) == len(SENTENCES)
+
+
+def test_sentences_come_to_what_they_mean_and_none_is_misunderstood() -> None:
+    verdicts = [(sentence, judge(sentence)) for sentence in SENTENCES]
+    misunderstood = [
+        (sentence.scene, sentence.say, verdict.detail)
+        for sentence, verdict in verdicts
+        if verdict.kind in {"wrong", "crash"}
+    ]
+    assert not misunderstood
+    for half, least in zip(HALVES, (0.95, 0.85), strict=True):
+        kinds = [verdict.kind for sentence, verdict in verdicts if sentence.half == half]
+        assert kinds.count("right") >= least * len(kinds)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "kind"),
+    [
+        (
+            Sentence(scene="groceries", say="Put the milk in the basket.", then=(("in", "butter_1", "basket_1"),)),
+            "wrong",
+        ),
+        (
+            Sentence(scene="groceries", say="Put the milk in the basket.", then=(("near", "milk_1", "basket_1"),)),
+            "wrong",
+        ),
+        (Sentence(scene="groceries", say="Put the milk in the basket.", refused=("milk",)), "wrong"),
+        (Sentence(scene="groceries", say="Put the kiwi in the basket.", then=(("held", "milk_1"),)), "refused"),
+        (Sentence(scene="groceries", say="Put the kiwi in the basket.", refused=("pear",)), "other reason"),
+    ],
+)
+def test_the_judge_tells_what_is_not_as_expected(wrong: Sentence, kind: str) -> None:
+    assert judge(wrong).kind == kind
+
+
+def program(text: str) -> str | None:
+    """The planner's program, or None for a refusal that gives a reason."""
+    try:
+        written = write_planner(text, NAMES)
+    except NotUnderstood as error:
+        reason = str(error).strip()
+        if not reason:
+            pytest.fail(f"no reason for refusing {text!r}")
+        return None
+    ast.parse(written)
+    return written
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.text(max_size=400))
+def test_any_text_is_planned_or_refused(text: str) -> None:
+    program(text)
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.lists(st.sampled_from(WORDS), max_size=25))
+def test_any_words_are_planned_or_refused(words: list[str]) -> None:
+    program(" ".join(words))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.text(max_size=60))
+def test_any_phrase_is_parsed_or_refused(text: str) -> None:
+    with contextlib.suppress(NotUnderstood):
+        assert read_noun(text).words
+
+
+@pytest.mark.parametrize(
+    "text", ["", " ", ".", "\u200b", "put " * 5000, "x" * 100_000, "put the bowl on " + "the " * 150]
+)
+def test_empty_and_long_texts_are_refused(text: str) -> None:
+    assert program(text) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "quoted"),
+    [
+        ("put the teapot on the plate", "teapot"),
+        ("juggle the bottle", "juggle"),
+        ("put the bottle on the plate if it is full", "if it is full"),
+        ("put the third bowl on the plate", "third"),
+        ("put the bottle on the plate or on the stove", "or"),
+        ("setze die Flasche auf den Teller", "setze"),
+        ("put the bottle onto the Käsebrett", "käsebrett"),
+        ("put both plates on the stove", "both plate"),
+        ("put the left bowl and the bottle on the plate and the plate", "moved too"),
+        ("put the bottle and the plate into themselves", "themselves"),
+    ],
+)
+def test_a_refusal_quotes_the_words_that_are_not_understood(text: str, quoted: str) -> None:
+    with pytest.raises(NotUnderstood, match=quoted):
+        write_planner(text, NAMES)
+
+
+@pytest.mark.parametrize(
+    "phrase",
+    [
+        "the second bowl from the left",
+        "the last bowl from the front",
+        "the largest bowl",
+        "the second tallest bowl",
+        "the bowl nearest to the plate",
+        "the second bowl farthest from the plate",
+        "the bowl except the bowl on the left",
+        "the bowl on the right besides the 1 on the plate_1",
+        "the bowl nearest to the plate besides the 2 in the tray_1 besides the 1 on top of the stove",
+        "the two smallest bowl",
+    ],
+)
+def test_descriptions_written_out_are_parsed_to_the_same(phrase: str) -> None:
+    noun = read_noun(phrase)
+    assert str(noun) == phrase
+    assert read_noun(str(noun)) == noun
+
+
+def test_order_words_change_the_order_of_doing() -> None:
+    told = {
+        "put the bottle on the plate after turning on the stove": ["turn_on", "put"],
+        "before you turn on the stove, put the bottle on the plate": ["put", "turn_on"],
+        "turn on the stove, but first put the bottle on the plate": ["put", "turn_on"],
+        "turn on the stove. Before that, put the bottle on the plate": ["put", "turn_on"],
+    }
+    for text, verbs in told.items():
+        assert [action.verb for action in understand(text, NAMES).actions] == verbs
+
+
+def test_lengths_have_units() -> None:
+    told = {
+        "5 cm": 5,
+        "5cm": 5,
+        "an inch": 2.54,
+        "two and a half inches": 6.35,
+        "0.1 m": 10,
+        "30 mm": 3,
+        "half a foot": 15.24,
+    }
+    for length, cm in told.items():
+        (action,) = understand(f"put the bottle {length} to the left of the plate", NAMES).actions
+        assert action.place is not None
+        assert action.place.cm == pytest.approx(cm)
+
+
+def test_many_objects_make_a_short_program() -> None:
+    names = [*(f"thing_{index}" for index in range(8)), "basket_1"]
+    written = write_planner(
+        "put everything in the basket", [f"red_{name}" if name != "basket_1" else name for name in names]
+    )
+    assert written.count("composer(") == 7
+    assert "for thing in [" in written
