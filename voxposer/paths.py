@@ -39,6 +39,8 @@ def plan_paths(
 def _planned(
     wants: Sequence[tuple[Interface, MotionRequest]], config: PlannerConfig, route: RouteConfig
 ) -> list[np.ndarray | InterfaceError]:
+    if config.method == "straight":
+        return [straight_path(start_of(*want), want[1], config) for want in wants]
     padded = [*wants, *[wants[-1]] * ((1 if len(wants) == 1 else CHUNK) - len(wants))]
     starts = np.stack([start_of(interface, request) for interface, request in padded])
     obstacles = [obstacle_map(interface.perception, request, route) for interface, request in wants]
@@ -57,6 +59,16 @@ def _planned(
         else InterfaceError(f"no path to the targets: {Fault(int(fault[i])).name.lower().replace('_', ' ')}")
         for i in range(len(wants))
     ]
+
+
+def straight_path(start: np.ndarray, request: MotionRequest, config: PlannerConfig) -> np.ndarray:
+    """A straight line over voxels [P, 3] to the nearest target; an object that is pushed keeps its height."""
+    targets = np.argwhere(request.targets)
+    end = targets[int(np.linalg.norm(targets - start, axis=1).argmin())].astype(float)
+    end[2] = start[2] if request.object_centric else end[2]
+    count = max(int(np.linalg.norm(end - start)), 1)
+    path = start + np.linspace(0, 1, count + 1)[:, None] * (end - start)
+    return np.concatenate([path[:: config.pushing_skip_per_k], path[-1:]])[1:] if request.object_centric else path
 
 
 def start_of(interface: Interface, request: MotionRequest) -> np.ndarray:

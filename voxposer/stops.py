@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vecenv.manipulation.routes import RouteConfig, Stop, travel_route, work_route
+from vecenv.manipulation.routes import RouteConfig, Stop, planned_route, travel_route, work_route
 from vecenv.manipulation.world import matrix
 from voxposer.paths import is_contact_motion
 from voxposer.perception.view import Perception
@@ -50,7 +50,9 @@ def stops_of(
 
 
 def travel(stops: list[Stop], perception: Perception, route: RouteConfig) -> list[Stop]:
-    """Stops raised over the scene (``vecenv.manipulation.routes.travel_route``)."""
+    """The stops of a hand that travels: raised over the scene, or, as ``route.mode`` says, those of its path."""
+    if route.mode == "planned":
+        return planned_route(stops, route)
     axes = matrix(stops[0].quat)[:, 2], matrix(stops[-1].quat)[:, 2]
     held = perception.held if stops[0].closed else ""
     return travel_route(stops, axes, perception.scene, held, route)

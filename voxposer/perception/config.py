@@ -7,6 +7,7 @@ fills in for each slot.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -36,6 +37,12 @@ class PerceptionConfig:
         above: height of the hand over an object when it has nothing to put down.
         edge: distance from the border of a place that the centre of what is put there keeps.
         home_reach: distance of the hand before the robot's base when an episode begins.
+        fields: what the grasp, place and push fields of an observation hold. ``"geometry"``: poses found by geometry
+            on ground-truth surface points and boxes. ``"centroid"``: what upstream's programs have to go by, the
+            middle of an object for a grasp, the middle of its top for a place, and the hand pointing down.
+
+    Raises:
+        ValueError: there are no such fields.
     """
 
     margins: Margins = field(default_factory=lambda: Margins(gripper=Gripper(wrist=0.14), grasp_tilts=(0.3, 0.6)))
@@ -53,6 +60,11 @@ class PerceptionConfig:
     above: float = 0.10
     edge: float = 0.03
     home_reach: float = 0.45
+    fields: Literal["geometry", "centroid"] = "geometry"
+
+    def __post_init__(self) -> None:
+        if self.fields not in ("geometry", "centroid"):
+            raise ValueError(f"fields must be 'geometry' or 'centroid', got {self.fields!r}")
 
 
 @dataclass(frozen=True)
