@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vecenv.manipulation.routes import RouteConfig, is_contact_move
+from vecenv.manipulation.routes import RouteConfig, Stop, is_contact_move
 from voxposer.interface import Interface
+from voxposer.mapped import plan_mapped
 from voxposer.perception.view import Perception
 from voxposer.planning import maps
 from voxposer.planning.config import Fault, PlannerConfig
@@ -29,6 +30,10 @@ def plan_paths(
     """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path."""
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
     asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None]
+    if route.mode == "map" and config.method == "greedy":
+        mapped = [i for i in asking if travels(*wants[i], route)]
+        paths = [_mapped(*want, config, route) if i in mapped else paths[i] for i, want in enumerate(wants)]
+        asking = [i for i in asking if i not in mapped]
     for first in range(0, len(asking), CHUNK):
         chunk = asking[first : first + CHUNK]
         for i, path in zip(chunk, _planned([wants[i] for i in chunk], config, route), strict=True):
@@ -59,6 +64,24 @@ def _planned(
         else InterfaceError(f"no path to the targets: {Fault(int(fault[i])).name.lower().replace('_', ' ')}")
         for i in range(len(wants))
     ]
+
+
+def travels(interface: Interface, request: MotionRequest, route: RouteConfig) -> bool:
+    """Whether a request moves the hand through the scene, neither pushing nor pulling."""
+    return not request.object_centric and not is_contact_motion(interface.perception, request, route)
+
+
+def _mapped(interface: Interface, request: MotionRequest, config: PlannerConfig, route: RouteConfig) -> np.ndarray:
+    """The path of a request over configuration-space maps; where it turns is kept in the view."""
+    perception = interface.perception
+    here = perception.grid.voxel(perception.ee.pos)
+    ends = np.argwhere(request.targets)
+    end = ends[int(np.linalg.norm(ends - here, axis=1).argmin())]
+    goal = Stop(perception.position_of(end), request.rotation_at(end), request.closed_at_end(end))
+    closed = perception.closed and request.closed_at(here)
+    found = plan_mapped(perception, goal, closed=closed, avoidance=request.avoidance, planner=config, route=route)
+    perception.turns[request] = found.turn
+    return found.path
 
 
 def straight_path(start: np.ndarray, request: MotionRequest, config: PlannerConfig) -> np.ndarray:

@@ -21,7 +21,7 @@ from vecenv.manipulation.world import SceneGeometry, around
 # Hands whose axis has at most this vertical component point down.
 _UPRIGHT = -0.98
 # How a planned path becomes a route.
-RouteMode = Literal["raised", "planned"]
+RouteMode = Literal["raised", "planned", "map"]
 # Distances by which a hand moves an object aside from under an overhang, metres.
 _ASIDE = (0.02, 0.04, 0.06, 0.08, 0.10, 0.12)
 
@@ -32,7 +32,8 @@ class RouteConfig:
 
     Attributes:
         mode: ``"raised"``: a hand that travels is rerouted over surface points, whatever the planner's path (this
-            module). ``"planned"``: it follows the planner's path.
+            module). ``"planned"``: it follows the planner's path. ``"map"``: it follows the planner's path over
+            configuration-space maps of hand and load (``voxposer.mapped``).
         over: vertical room over whatever lies on the way.
         corridor: half width of what counts as on the way.
         approach: the least distance from which a goal is approached along the hand's axis.
@@ -44,6 +45,13 @@ class RouteConfig:
         work_reach: and at most this far away.
         step: distance of the samples at which obstacles on the way are looked for.
         exact: a path that is followed as planned is thinned out to stops from which it deviates at most this much.
+        margin: in maps, room around hand and load beyond which more is no better.
+        turning: in maps, room with which a hand may turn.
+        touch: in maps, a hand that comes or goes along its own axis may be so far inside something: samples of surfaces
+            and voxels are not exact.
+        near_price: in maps, price of a metre that touches something, beyond that of a free one, which is 1.
+        hit_price: in maps, price of a metre inside something or where the program wants none.
+        deep_price: in maps, price of a metre for each metre of depth inside something.
 
     Raises:
         ValueError: there is no such mode.
@@ -61,6 +69,12 @@ class RouteConfig:
     work_reach: float = 0.35
     step: float = 0.03
     exact: float = 0.003
+    margin: float = 0.03
+    turning: float = 0.012
+    touch: float = 0.006
+    near_price: float = 4.0
+    hit_price: float = 20.0
+    deep_price: float = 2000.0
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(RouteMode):

@@ -14,6 +14,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -52,6 +53,8 @@ class Perception:
         exact: voxel -> world position [3] that was rounded to it, for every grasp and place read so far.
         targets: voxel -> name of the object that the grasp read there is for.
         closed: whether the hand is taken to be closed at :attr:`ee`.
+        turns: of motions that were planned over configuration-space maps, the waypoint from which the hand has the
+            rotation of the goal (``voxposer.mapped``).
     """
 
     def __init__(
@@ -74,6 +77,7 @@ class Perception:
         self._places: dict[str, HandPose] = {}
         self._ee = HandPose(snapshot.ee_pose[:3], matrix(snapshot.ee_pose[3:]))
         self.closed = hand.closed
+        self.turns: WeakKeyDictionary[object, int] = WeakKeyDictionary()
 
     # -- names ---------------------------------------------------------------------------------------------------------
 

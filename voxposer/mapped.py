@@ -1,0 +1,191 @@
+"""Paths over configuration-space maps: value maps that know the hand, what it carries, and the height of everything.
+
+In: a view of the scene, and the pose that the hand is to reach. Out: a path of the planner that is followed as it is
+(``route.mode="map"``), and where along it the hand turns. Three maps are made for each motion:
+
+* avoidance: the room around the hand and its load at every voxel (``vecenv.manipulation.rooms``), once as the hand is
+  rotated at the start and once as at the goal, plus what the program wants to avoid, as a price per metre;
+* rotation: the start's in the zone that the hand must leave before it has room to turn, the goal's elsewhere;
+* affordance: the cost to go to the goal over those prices (``voxposer.planning.cost_to_go``), which has no other minimum.
+
+Voxels are 1 cm wide and a grasp leaves a few millimetres, so the maps' voxels are moved to have one exactly at the start
+and, outside that zone, one exactly at the goal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from vecenv.manipulation import rooms
+from vecenv.manipulation.rooms import Lattice, Solid
+from vecenv.manipulation.routes import RouteConfig, Stop
+from vecenv.manipulation.world import matrix
+from voxposer.perception.view import Perception
+from voxposer.planning.config import PlannerConfig
+from voxposer.planning.cost_to_go import cost_to_go, flood
+from voxposer.planning.planner import descend_value
+
+# Voxels are twice as fine in height as across: every other layer is computed.
+_LAYERS = 2
+# Samples of the descent that are smoothed together: bends at a grasp are sharp.
+_WINDOW = 6
+# Waypoints over which a path goes over from the start's voxels to the goal's.
+_BLEND = 6
+
+
+@dataclass(frozen=True)
+class MappedPath:
+    """A path and its rotations.
+
+    Attributes:
+        path: over voxels, the start first and the exact goal last, [P, 3].
+        turn: index of the first waypoint with the goal's rotation.
+        value: the affordance map that was descended: cost to go, 1 and more where none is known, [N, N, N].
+        room: least room around hand and load on the way, metres.
+    """
+
+    path: np.ndarray
+    turn: int
+    value: np.ndarray
+    room: float
+
+
+def plan_mapped(
+    perception: Perception,
+    goal: Stop,
+    *,
+    closed: bool,
+    avoidance: np.ndarray | None,
+    planner: PlannerConfig,
+    route: RouteConfig,
+) -> MappedPath:
+    """The way of the hand from where it is to a goal.
+
+    Args:
+        perception: the view, the hand where the motion starts.
+        goal: the pose to reach.
+        closed: the grip on the way.
+        avoidance: what else to keep away from, 0 to 1, [N, N, N].
+        planner: numbers of the planner.
+        route: distances to keep, and prices.
+    """
+    grid = perception.grid
+    held = perception.held if closed else ""
+    scene = _Surroundings(perception, held, closed, route)
+    start_rotation, goal_rotation = perception.ee.rotation, matrix(goal.quat)
+    step = grid.resolution * grid.size / (grid.size - 1)
+    lattice = Lattice(grid.lo, step * [1, 1, _LAYERS], (grid.size, grid.size, -(-grid.size // _LAYERS)))
+    at_start, at_goal = _anchored(lattice, perception.ee.pos), _anchored(lattice, goal.pos)
+    start, end = at_start.index(perception.ee.pos), at_goal.index(goal.pos)
+    leaving = scene.room(at_start, start_rotation)
+    coming = scene.room(at_goal, goal_rotation)
+    turning = _while_turning(scene, at_goal, start_rotation, goal_rotation, coming)
+    extra = np.zeros(lattice.shape, np.float32) if avoidance is None else avoidance[:, :, ::_LAYERS]
+    prices = [
+        _price(_with_own_axis(room, at, pose, rotation, route), extra, route)
+        for room, at, pose, rotation in (
+            (leaving, at_start, perception.ee.pos, start_rotation),
+            (coming, at_goal, goal.pos, goal_rotation),
+        )
+    ]
+    free = np.minimum(np.minimum(leaving, coming), turning) >= route.turning
+    cost, found = flood(prices[0], lattice.step, start, free)
+    zone = cost < found if np.isfinite(found) else np.isfinite(cost) & (leaving > coming)
+    price = np.where(zone, prices[0], prices[1])
+    value = cost_to_go(price, lattice.step, end, start)
+    return _followed(perception, goal, value, zone, np.where(zone, leaving, coming), (at_start, at_goal), start, planner)
+
+
+class _Surroundings:
+    """The room around one hand, with its load, in one scene."""
+
+    def __init__(self, perception: Perception, held: str, closed: bool, route: RouteConfig) -> None:
+        snapshot, margins = perception.snapshot, perception.config.margins
+        self._margin = route.margin
+        opening = float(snapshot.gripper[0] - snapshot.gripper[1]) if closed else None
+        self._solids: list[Solid] = rooms.hand_solids(margins.gripper, opening=opening)
+        if held:
+            axes, rotation = matrix(snapshot.poses[held][3:]), matrix(snapshot.ee_pose[3:])
+            points = snapshot.objects[held].points
+            self._solids.append(rooms.load_solid(points, axes, snapshot.ee_pose[:3], rotation))
+        clouds = [rooms.dense_surface(cloud) for name, cloud in snapshot.objects.items() if name != held]
+        moving = [rooms.dense_surface(part.cloud) for part in snapshot.parts.values() if part.joint is not None]
+        self._points = np.concatenate([*clouds, *moving, perception.scene.walls])
+        self._ground = perception.scene.ground(perception.ee.pos[:2])
+
+    def room(self, lattice: Lattice, rotation: np.ndarray) -> np.ndarray:
+        """Room at each node, metres."""
+        found = rooms.room_map(lattice, self._solids, rotation, self._points, self._margin)
+        heights = lattice.origin[2] + np.arange(lattice.shape[2]) * lattice.step[2]
+        over = heights + rooms.lowest(self._solids, rotation) - self._ground
+        return np.minimum(found, over.astype(np.float32))
+
+
+def _while_turning(
+    scene: _Surroundings, lattice: Lattice, first: np.ndarray, last: np.ndarray, otherwise: np.ndarray
+) -> np.ndarray:
+    """Room of a hand half-way between two rotations; ``otherwise`` where they hardly differ."""
+    between = Rotation.from_matrix(np.stack([first, last]))
+    if (between[0].inv() * between[1]).magnitude() < 0.3:
+        return otherwise
+    return scene.room(lattice, Slerp([0, 1], between)([0.5]).as_matrix()[0])
+
+
+def _anchored(lattice: Lattice, position: np.ndarray) -> Lattice:
+    """The lattice moved so that a position is one of its nodes."""
+    node = np.array(lattice.index(position))
+    return lattice.shifted(np.clip(position - lattice.origin - node * lattice.step, -lattice.step / 2, lattice.step / 2))
+
+
+def _with_own_axis(
+    room: np.ndarray, lattice: Lattice, position: np.ndarray, rotation: np.ndarray, route: RouteConfig
+) -> np.ndarray:
+    """Room, with ``route.margin`` on the line on which a hand comes to a position, or goes, along its own axis."""
+    axis = rotation[:, 2]
+    x, y, z = (lattice.origin[k] + np.arange(lattice.shape[k]) * lattice.step[k] - position[k] for k in range(3))
+    offset = x[:, None, None], y[None, :, None], z[None, None, :]
+    back = -sum(part * share for part, share in zip(offset, axis, strict=True))
+    square = sum(part**2 for part in offset) - back**2
+    near = (back >= -1e-6) & (back <= route.approach) & (square <= (0.6 * float(lattice.step.max())) ** 2)
+    return np.where(near & (room > -route.touch), route.margin, room)
+
+
+def _price(room: np.ndarray, avoided: np.ndarray, route: RouteConfig) -> np.ndarray:
+    """Of a metre: 1 where there is room enough, more nearer to obstacles, most inside them."""
+    near = np.clip(1 - room / route.margin, 0, 1)
+    inside = np.maximum(-room, 0)
+    price = 1 + route.near_price * near**2 + (room < 0) * route.hit_price + route.deep_price * inside
+    return (price + route.hit_price * avoided).astype(np.float32)
+
+
+def _followed(
+    perception: Perception,
+    goal: Stop,
+    value: np.ndarray,
+    zone: np.ndarray,
+    room: np.ndarray,
+    lattices: tuple[Lattice, Lattice],
+    start: tuple[int, int, int],
+    planner: PlannerConfig,
+) -> MappedPath:
+    """The planner's descent of a value map, from voxels to positions."""
+    grid = perception.grid
+    full = np.repeat(value, _LAYERS, axis=2)[:, :, : grid.size].astype(float)
+    full[:, :, 1:-1:_LAYERS] = (full[:, :, 0:-2:_LAYERS] + full[:, :, 2::_LAYERS]) / 2
+    most = float(value[start]) or 1.0
+    full = np.where(np.isfinite(full), full / most, 2.0 + np.zeros_like(full))
+    first = np.array(start) * [1, 1, _LAYERS]
+    _, path = descend_value(first, full, replace(planner, savgol_window_size=min(planner.savgol_window_size, _WINDOW)))
+    nodes = np.clip(np.round(path / [1, 1, _LAYERS]), 0, np.array(value.shape) - 1).astype(int)
+    inside = zone[tuple(nodes.T)]
+    turn = int(np.flatnonzero(inside)[-1]) + 1 if inside.any() else 0
+    share = np.clip((np.arange(len(path)) - turn + 1) / _BLEND, 0, 1)[:, None]
+    step = grid.resolution * grid.size / (grid.size - 1)
+    shifts = [(lattice.origin - grid.lo) / step for lattice in lattices]
+    moved = path + (1 - share) * shifts[0] + share * shifts[1]
+    moved[0] = (perception.ee.pos - grid.lo) / step
+    moved = np.concatenate([moved, ((goal.pos - grid.lo) / step)[None]])
+    return MappedPath(moved, turn, full, float(room[tuple(nodes.T)].min()))
