@@ -231,9 +231,7 @@ def run(numbers: Sequence[int], variant: str) -> list[Outcome]:
     ]
 
 
-def _displacement(
-    before: ObjectsSnapshot, after: ObjectsSnapshot | None, own: tuple[str, ...]
-) -> dict[str, float]:
+def _displacement(before: ObjectsSnapshot, after: ObjectsSnapshot | None, own: tuple[str, ...]) -> dict[str, float]:
     if after is None:
         return {}
     names = [name for name in before.movable if name not in own]

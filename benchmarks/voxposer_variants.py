@@ -41,10 +41,15 @@ VARIANTS: Mapping[str, Variant] = {
         "the same with straight lines in place of the planner, planner.method='straight'",
         lambda config: _straight(_route("raised")(config)),
     ),
-    "map": Variant("configuration-space maps, and the planner's path followed as it is, route.mode='map'", _route("map")),
-    "planned": Variant("upstream's maps, and the planner's path followed as it is, route.mode='planned'", _route("planned")),
+    "map": Variant(
+        "configuration-space maps, and the planner's path followed as it is, route.mode='map'", _route("map")
+    ),
+    "planned": Variant(
+        "upstream's maps, and the planner's path followed as it is, route.mode='planned'", _route("planned")
+    ),
     "straight": Variant(
-        "straight lines in place of the planner, followed as they are", lambda config: _straight(_route("planned")(config))
+        "straight lines in place of the planner, followed as they are",
+        lambda config: _straight(_route("planned")(config)),
     ),
     "centroid": Variant("no grasp and place fields: centroids, perception.fields='centroid'", _centroid),
 }

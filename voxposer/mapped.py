@@ -17,9 +17,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from vecenv.manipulation import rooms
+from vecenv.manipulation.reach import PandaArm
 from vecenv.manipulation.rooms import Lattice, Solid
 from vecenv.manipulation.routes import RouteConfig, Stop
 from vecenv.manipulation.world import matrix
@@ -27,13 +29,24 @@ from voxposer.perception.view import Perception
 from voxposer.planning.config import PlannerConfig
 from voxposer.planning.cost_to_go import cost_to_go, flood
 from voxposer.planning.planner import descend_value
+from voxposer.requests import InterfaceError
 
 # Voxels are twice as fine in height as across: every other layer is computed.
 _LAYERS = 2
 # Samples of the descent that are smoothed together: bends at a grasp are sharp.
 _WINDOW = 6
+# How often a path is planned again around places that the arm cannot reach, and how far from those, metres.
+_REPLANS, _AVOIDED = 2, 0.04
+# Points that would be nearer to a hand that is where it is do not count, metres.
+_CONTACT = 0.002
+# Rotations that differ by less need no room to turn, radians.
+_TURNED = 0.3
 # Waypoints over which a path goes over from the start's voxels to the goal's.
 _BLEND = 6
+
+
+class OutOfReach(InterfaceError):
+    """The arm cannot take the pose that a motion is to end with."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +74,7 @@ def plan_mapped(
     avoidance: np.ndarray | None,
     planner: PlannerConfig,
     route: RouteConfig,
+    exact: bool = True,
 ) -> MappedPath:
     """The way of the hand from where it is to a goal.
 
@@ -71,6 +85,10 @@ def plan_mapped(
         avoidance: what else to keep away from, 0 to 1, [N, N, N].
         planner: numbers of the planner.
         route: distances to keep, and prices.
+        exact: the goal is a grasp or a place; otherwise it may give way to obstacles by ``route.freed``.
+
+    Raises:
+        OutOfReach: the arm cannot take the goal.
     """
     grid = perception.grid
     held = perception.held if closed else ""
@@ -80,12 +98,16 @@ def plan_mapped(
     lattice = Lattice(grid.lo, step * [1, 1, _LAYERS], (grid.size, grid.size, -(-grid.size // _LAYERS)))
     at_start, at_goal = _anchored(lattice, perception.ee.pos), _anchored(lattice, goal.pos)
     start, end = at_start.index(perception.ee.pos), at_goal.index(goal.pos)
-    leaving = scene.room(at_start, start_rotation)
-    coming = scene.room(at_goal, goal_rotation)
-    turning = _while_turning(scene, at_goal, start_rotation, goal_rotation, coming)
+    here, there = (perception.ee.pos, start_rotation), (goal.pos, goal_rotation)
+    leaving = scene.room(at_start, start_rotation, here)
+    coming = scene.room(at_goal, goal_rotation, there if exact else here)
+    if not exact and coming[end] < 0:
+        end = _freed(at_goal, end, coming, route)
+        goal = replace(goal, pos=at_goal.origin + np.array(end) * at_goal.step)
+    turning = _while_turning(scene, at_goal, here, goal_rotation, coming)
     extra = np.zeros(lattice.shape, np.float32) if avoidance is None else avoidance[:, :, ::_LAYERS]
     prices = [
-        _price(_with_own_axis(room, at, pose, rotation, route), extra, route)
+        _price(room if held else _with_own_axis(room, at, pose, rotation, route), extra, route)
         for room, at, pose, rotation in (
             (leaving, at_start, perception.ee.pos, start_rotation),
             (coming, at_goal, goal.pos, goal_rotation),
@@ -94,9 +116,52 @@ def plan_mapped(
     free = np.minimum(np.minimum(leaving, coming), turning) >= route.turning
     cost, found = flood(prices[0], lattice.step, start, free)
     zone = cost < found if np.isfinite(found) else np.isfinite(cost) & (leaving > coming)
-    price = np.where(zone, prices[0], prices[1])
-    value = cost_to_go(price, lattice.step, end, start)
-    return _followed(perception, goal, value, zone, np.where(zone, leaving, coming), (at_start, at_goal), start, planner)
+    price, room = np.where(zone, prices[0], prices[1]), np.where(zone, leaving, coming)
+    for _ in range(_REPLANS + 1):
+        value = cost_to_go(price, lattice.step, end, start)
+        found = _followed(perception, goal, value, zone, room, (at_start, at_goal), start, planner)
+        beyond = _out_of_reach(perception, found, start_rotation, goal_rotation)
+        if not len(beyond):
+            return found
+        price = price + route.hit_price * _near_any(lattice, beyond)
+    return found
+
+
+def _out_of_reach(perception: Perception, found: MappedPath, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Positions on a path that the arm cannot take, its ends left out, [K, 3]; none for an arm that is not known.
+
+    Raises:
+        OutOfReach: the arm cannot take the goal.
+    """
+    base = perception.snapshot.panda_base
+    if base is None:
+        return np.zeros((0, 3))
+    way = perception.grid.world(found.path)
+    turned = np.where((np.arange(len(way)) < found.turn)[:, None, None], first, last)
+    reached = PandaArm(base).reaches(way, turned)
+    if not reached[-1]:
+        at = ", ".join(f"{x:.2f}" for x in way[-1])
+        raise OutOfReach(f"the arm has no joint angles for the goal of a motion, the hand at {at}")
+    return way[1:-1][~reached[1:-1]]
+
+
+def _near_any(lattice: Lattice, places: np.ndarray) -> np.ndarray:
+    """Which nodes of a lattice are near some places [K, 3], bool [X, Y, Z]."""
+    nodes = np.stack(np.meshgrid(*(np.arange(n) for n in lattice.shape), indexing="ij"), axis=-1)
+    far = cKDTree(places).query((lattice.origin + nodes * lattice.step).reshape(-1, 3), distance_upper_bound=_AVOIDED)[
+        0
+    ]
+    return np.isfinite(far).reshape(lattice.shape)
+
+
+def _freed(lattice: Lattice, end: tuple[int, int, int], room: np.ndarray, route: RouteConfig) -> tuple[int, int, int]:
+    """The node with room nearest to one without; the same one if there is none near."""
+    there = np.argwhere(room >= route.turning)
+    far = np.linalg.norm((there - np.array(end)) * lattice.step, axis=1)
+    if not len(there) or far.min() > route.freed:
+        return end
+    x, y, z = there[int(far.argmin())]
+    return int(x), int(y), int(z)
 
 
 class _Surroundings:
@@ -110,34 +175,44 @@ class _Surroundings:
         if held:
             axes, rotation = matrix(snapshot.poses[held][3:]), matrix(snapshot.ee_pose[3:])
             points = snapshot.objects[held].points
-            self._solids.append(rooms.load_solid(points, axes, snapshot.ee_pose[:3], rotation))
+            self._solids += rooms.load_solids(points, axes, snapshot.ee_pose[:3], rotation)
         clouds = [rooms.dense_surface(cloud) for name, cloud in snapshot.objects.items() if name != held]
         moving = [rooms.dense_surface(part.cloud) for part in snapshot.parts.values() if part.joint is not None]
         self._points = np.concatenate([*clouds, *moving, perception.scene.walls])
         self._ground = perception.scene.ground(perception.ee.pos[:2])
 
-    def room(self, lattice: Lattice, rotation: np.ndarray) -> np.ndarray:
-        """Room at each node, metres."""
-        found = rooms.room_map(lattice, self._solids, rotation, self._points, self._margin)
+    def room(self, lattice: Lattice, rotation: np.ndarray, known: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Room at each node, metres.
+
+        Args:
+            lattice: positions of the hand.
+            rotation: of the hand, [3, 3].
+            known: position [3] and rotation [3, 3] of a hand that is possible: points that would be inside it lie on
+                surfaces that are not quite where samples and boxes say, and do not count.
+        """
+        points = self._points[rooms.outside(self._points, self._solids, *known, _CONTACT)]
+        found = rooms.room_map(lattice, self._solids, rotation, points, self._margin)
         heights = lattice.origin[2] + np.arange(lattice.shape[2]) * lattice.step[2]
         over = heights + rooms.lowest(self._solids, rotation) - self._ground
         return np.minimum(found, over.astype(np.float32))
 
 
 def _while_turning(
-    scene: _Surroundings, lattice: Lattice, first: np.ndarray, last: np.ndarray, otherwise: np.ndarray
+    scene: _Surroundings, lattice: Lattice, here: tuple[np.ndarray, np.ndarray], last: np.ndarray, otherwise: np.ndarray
 ) -> np.ndarray:
     """Room of a hand half-way between two rotations; ``otherwise`` where they hardly differ."""
-    between = Rotation.from_matrix(np.stack([first, last]))
-    if (between[0].inv() * between[1]).magnitude() < 0.3:
+    between = Rotation.from_matrix(np.stack([here[1], last]))
+    if (between[0].inv() * between[1]).magnitude() < _TURNED:
         return otherwise
-    return scene.room(lattice, Slerp([0, 1], between)([0.5]).as_matrix()[0])
+    return scene.room(lattice, Slerp([0, 1], between)([0.5]).as_matrix()[0], here)
 
 
 def _anchored(lattice: Lattice, position: np.ndarray) -> Lattice:
     """The lattice moved so that a position is one of its nodes."""
     node = np.array(lattice.index(position))
-    return lattice.shifted(np.clip(position - lattice.origin - node * lattice.step, -lattice.step / 2, lattice.step / 2))
+    return lattice.shifted(
+        np.clip(position - lattice.origin - node * lattice.step, -lattice.step / 2, lattice.step / 2)
+    )
 
 
 def _with_own_axis(
@@ -178,7 +253,9 @@ def _followed(
     most = float(value[start]) or 1.0
     full = np.where(np.isfinite(full), full / most, 2.0 + np.zeros_like(full))
     first = np.array(start) * [1, 1, _LAYERS]
-    _, path = descend_value(first, full, replace(planner, savgol_window_size=min(planner.savgol_window_size, _WINDOW)))
+    # The goal costs 0, and what is next to it little in comparison with a way that has to touch something.
+    window = min(planner.savgol_window_size, _WINDOW)
+    _, path = descend_value(first, full, replace(planner, savgol_window_size=window, stop_threshold=0.0))
     nodes = np.clip(np.round(path / [1, 1, _LAYERS]), 0, np.array(value.shape) - 1).astype(int)
     inside = zone[tuple(nodes.T)]
     turn = int(np.flatnonzero(inside)[-1]) + 1 if inside.any() else 0

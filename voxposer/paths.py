@@ -13,7 +13,7 @@ import numpy as np
 
 from vecenv.manipulation.routes import RouteConfig, Stop, is_contact_move
 from voxposer.interface import Interface
-from voxposer.mapped import plan_mapped
+from voxposer.mapped import OutOfReach, plan_mapped
 from voxposer.perception.view import Perception
 from voxposer.planning import maps
 from voxposer.planning.config import Fault, PlannerConfig
@@ -71,7 +71,9 @@ def travels(interface: Interface, request: MotionRequest, route: RouteConfig) ->
     return not request.object_centric and not is_contact_motion(interface.perception, request, route)
 
 
-def _mapped(interface: Interface, request: MotionRequest, config: PlannerConfig, route: RouteConfig) -> np.ndarray:
+def _mapped(
+    interface: Interface, request: MotionRequest, config: PlannerConfig, route: RouteConfig
+) -> np.ndarray | InterfaceError:
     """The path of a request over configuration-space maps; where it turns is kept in the view."""
     perception = interface.perception
     here = perception.grid.voxel(perception.ee.pos)
@@ -79,7 +81,12 @@ def _mapped(interface: Interface, request: MotionRequest, config: PlannerConfig,
     end = ends[int(np.linalg.norm(ends - here, axis=1).argmin())]
     goal = Stop(perception.position_of(end), request.rotation_at(end), request.closed_at_end(end))
     closed = perception.closed and request.closed_at(here)
-    found = plan_mapped(perception, goal, closed=closed, avoidance=request.avoidance, planner=config, route=route)
+    options = {"avoidance": request.avoidance, "planner": config, "route": route}
+    exact = tuple(int(index) for index in end) in perception.exact
+    try:
+        found = plan_mapped(perception, goal, closed=closed, exact=exact, **options)
+    except OutOfReach as error:
+        return error
     perception.turns[request] = found.turn
     return found.path
 

@@ -69,9 +69,7 @@ def travel(stops: list[Stop], perception: Perception, route: RouteConfig) -> lis
 
 def _mapped(here: Stop, goal: Stop, perception: Perception, route: RouteConfig) -> list[Stop]:
     """The way of a hand to a pose that no program asked for, over configuration-space maps."""
-    found = plan_mapped(
-        perception, goal, closed=here.closed, avoidance=None, planner=PlannerConfig(), route=route
-    )
+    found = plan_mapped(perception, goal, closed=here.closed, avoidance=None, planner=PlannerConfig(), route=route)
     way = perception.grid.world(found.path[:-1])
     stops = [replace(here, pos=at, quat=here.quat if i < found.turn else goal.quat) for i, at in enumerate(way)]
     return planned_route([*stops, goal], route)

@@ -1,6 +1,6 @@
 """Room around a hand, and what it carries, at every node of a lattice of its positions: a configuration-space map.
 
-The solids of a hand (:func:`hand_solids`, :func:`load_solid`), its rotation and obstacle points come in. Out comes, for
+The solids of a hand (:func:`hand_solids`, :func:`load_solids`), its rotation and obstacle points come in. Out comes, for
 each position of the grip site on a :class:`Lattice`, the smallest distance between the solids and an obstacle, negative
 where they overlap (:func:`room_map`). :func:`dense_surface` fills the gaps between sparse surface samples.
 """
@@ -8,6 +8,7 @@ where they overlap (:func:`room_map`). :func:`dense_surface` fills the gaps betw
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -18,6 +19,14 @@ from scipy.spatial import cKDTree
 from vecenv.manipulation.grasps import Gripper
 from vecenv.observations import PointCloud
 from vecenv.util.compiled import compile_function
+
+
+# Hands whose axis has at most this vertical component point down.
+_UPRIGHT = -0.98
+# Neighbours of a surface sample between which others are added.
+_NEIGHBOURS = 10
+# Slices of what a hand carries.
+_SLICES = 5
 
 
 @dataclass(frozen=True)
@@ -83,18 +92,24 @@ def _box(low: Sequence[float], high: Sequence[float], *, coarse: bool = False) -
     return Solid((lower + upper) / 2, (upper - lower) / 2, np.eye(3), coarse)
 
 
-def load_solid(points: np.ndarray, axes: np.ndarray, hand: np.ndarray, rotation: np.ndarray) -> Solid:
-    """The box around what a hand carries.
+def load_solids(points: np.ndarray, axes: np.ndarray, hand: np.ndarray, rotation: np.ndarray) -> list[Solid]:
+    """Boxes around what a hand carries: slices across its first axis, each as wide and high as the object is there.
 
     Args:
         points: its surface, world frame, [N, 3].
-        axes: its own axes, along which the box lies, columns, world frame, [3, 3].
+        axes: its own axes, along which the boxes lie, columns, world frame, [3, 3].
         hand: position of the grip site, [3].
         rotation: of the hand, [3, 3].
     """
-    local = (points - hand) @ axes
-    low, high = local.min(axis=0), local.max(axis=0)
-    return Solid(rotation.T @ axes @ ((low + high) / 2), (high - low) / 2, rotation.T @ axes)
+    local, turn = (points - hand) @ axes, rotation.T @ axes
+    edges = np.linspace(local[:, 0].min(), local[:, 0].max(), _SLICES + 1)
+    solids = []
+    for first, last in itertools.pairwise(edges):
+        part = local[(local[:, 0] >= first - 1e-9) & (local[:, 0] <= last + 1e-9)]
+        if len(part):
+            low, high = np.array([first, *part[:, 1:].min(axis=0)]), np.array([last, *part[:, 1:].max(axis=0)])
+            solids.append(Solid(turn @ ((low + high) / 2), (high - low) / 2, turn))
+    return solids
 
 
 def lowest(solids: Sequence[Solid], rotation: np.ndarray) -> float:
@@ -120,45 +135,62 @@ def room_map(
 
     Returns:
         float32 [lattice.shape], metres: the largest coordinate difference, in a solid's axes, between it and the nearest
-        obstacle; at most ``margin``, negative where an obstacle is inside.
+        obstacle; at most ``margin``, negative where an obstacle is inside. Coarse solids count within half of ``margin``.
     """
     room = np.full(lattice.shape, margin, np.float32)
-    thinned = _thinned(obstacles, 0.010)
-    fine = _thinned(obstacles, 0.004)
+    # Below the highest obstacle of a column others say nothing more about a palm that comes from above.
+    cell = [0.010, 0.010, np.inf] if rotation[2, 2] < _UPRIGHT else [0.010, 0.010, 0.010]
+    thinned, fine = _thinned(obstacles, np.array(cell)), _thinned(obstacles, np.full(3, 0.005))
     for solid in solids:
         axes, centre = np.ascontiguousarray(rotation @ solid.axes), rotation @ solid.centre
-        points = thinned if solid.coarse else fine
-        _kernel()(room, lattice.origin, lattice.step, points, axes, centre, solid.half, float(margin))
+        points, within = (thinned, margin / 2) if solid.coarse else (fine, margin)
+        _kernel()(room, lattice.origin, lattice.step, points, axes, centre, solid.half, float(within))
     return room
 
 
+def outside(
+    points: np.ndarray, solids: Sequence[Solid], position: np.ndarray, rotation: np.ndarray, least: float
+) -> np.ndarray:
+    """Which points [N, 3] are at least so far from the solids of a hand at a pose ([3] and [3, 3]), bool [N]."""
+    free = np.ones(len(points), bool)
+    for solid in solids:
+        local = (points - position - rotation @ solid.centre) @ (rotation @ solid.axes)
+        free &= (np.abs(local) - solid.half).max(axis=1) >= least
+    return free
+
+
 def dense_surface(cloud: PointCloud, pitch: float = 0.011) -> np.ndarray:
-    """Surface samples, with more of them in the tangent planes where they lie farther apart than ``pitch``, [M, 3]."""
+    """Surface samples, with more of them between neighbours in a plane that lie farther apart than ``pitch``, [M, 3].
+
+    Nothing is added beyond the samples, so that rims and openings stay where they are.
+    """
     points, normals = cloud.points, cloud.normals
-    if len(points) < 8:
+    if len(points) <= _NEIGHBOURS:
         return points
-    far = cKDTree(points).query(points, k=7)[0][:, -1]
-    spacing = float(np.median(far)) * np.sqrt(np.pi / 6)
-    reach = 0.55 * spacing
-    count = int(reach / pitch)
-    if not count:
+    far, near = cKDTree(points).query(points, k=_NEIGHBOURS + 1)
+    spacing = float(np.median(far[:, 6])) * np.sqrt(np.pi / 6)
+    if spacing < pitch:
         return points
-    ticks = np.arange(-count, count + 1) * pitch
-    u, v = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
-    near = np.hypot(u, v) <= reach
-    side = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    up = np.cross(normals, side)
-    spread = u[near][:, None, None] * side + v[near][:, None, None] * up
-    return (points + spread).reshape(-1, 3)
+    first, last, apart = np.repeat(np.arange(len(points)), _NEIGHBOURS), near[:, 1:].ravel(), far[:, 1:].ravel()
+    way = points[last] - points[first]
+    level = np.abs(np.einsum("ij,ij->i", way, normals[first])) < 0.15 * apart + 0.001
+    alike = np.einsum("ij,ij->i", normals[first], normals[last]) > 0.9
+    chosen = (first < last) & level & alike & (apart > pitch) & (apart < 1.8 * spacing)
+    filled = [points]
+    for count in range(1, int(1.8 * spacing / pitch) + 1):
+        rows = chosen & (apart > count * pitch)
+        filled.append(points[first[rows]] + way[rows] * (count * pitch / apart[rows])[:, None])
+    return np.concatenate(filled)
 
 
-def _thinned(points: np.ndarray, size: float) -> np.ndarray:
-    """One point of each cube."""
+def _thinned(points: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """The highest point of each cell of some extents [3]."""
     if not len(points):
         return np.zeros((0, 3))
-    _, first = np.unique(np.round(points / size).astype(np.int64), axis=0, return_index=True)
-    return np.ascontiguousarray(points[first], float)
+    descending = points[np.argsort(-points[:, 2], kind="stable")]
+    x, y, z = (np.round(descending / cell).astype(np.int64) + (1 << 20)).T
+    _, first = np.unique((x << 42) | (y << 21) | z, return_index=True)
+    return np.ascontiguousarray(descending[first], float)
 
 
 def _carve(
@@ -204,7 +236,5 @@ def _carve(
 @functools.cache
 def _kernel() -> Callable[..., None]:
     vector, table = numba.float64[::1], numba.float64[:, ::1]
-    signature = numba.void(
-        numba.float32[:, :, ::1], vector, vector, table, table, vector, vector, numba.float64
-    )
+    signature = numba.void(numba.float32[:, :, ::1], vector, vector, table, table, vector, vector, numba.float64)
     return compile_function(signature, _carve)

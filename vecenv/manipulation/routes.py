@@ -49,6 +49,7 @@ class RouteConfig:
         turning: in maps, room with which a hand may turn.
         touch: in maps, a hand that comes or goes along its own axis may be so far inside something: samples of surfaces
             and voxels are not exact.
+        freed: in maps, a goal that is neither grasp nor place gives way to obstacles by at most this much.
         near_price: in maps, price of a metre that touches something, beyond that of a free one, which is 1.
         hit_price: in maps, price of a metre inside something or where the program wants none.
         deep_price: in maps, price of a metre for each metre of depth inside something.
@@ -69,12 +70,13 @@ class RouteConfig:
     work_reach: float = 0.35
     step: float = 0.03
     exact: float = 0.003
-    margin: float = 0.03
+    margin: float = 0.035
     turning: float = 0.012
     touch: float = 0.006
-    near_price: float = 4.0
-    hit_price: float = 20.0
-    deep_price: float = 2000.0
+    freed: float = 0.12
+    near_price: float = 15.0
+    hit_price: float = 50.0
+    deep_price: float = 4000.0
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(RouteMode):
