@@ -3,10 +3,10 @@
     python benchmarks/voxposer_ablation.py
     python benchmarks/voxposer_ablation.py --suites libero_object --tasks 0-9 --episodes 0-2 --variants shipped,straight
 
-Each variant (``voxposer_variants.VARIANTS``) is a setting of public config fields. A row is a variant on a suite: how many
-episodes it solved, with a 95 % Wilson interval, and mean control steps. Every episode is stored as it ends in the folder
-``--work``; the same command continues where it was stopped, and ``--report`` writes the rows of what is there. Ground
-truth of the simulator is used in every variant but ``camera``; the column "privileged" says for what.
+Each variant (``voxposer_variants.VARIANTS``) is a setting of public config fields. A row is a variant on a suite: how
+many episodes it solved, with a 95 % Wilson interval, and mean control steps. Every episode is stored as it ends in the
+folder ``--work``; the same command continues where it was stopped, and ``--report`` writes the rows of what is there.
+Ground truth of the simulator is used in every variant but ``camera``; the column "privileged" says for what.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ def write(rows: list[dict[str, Any]], skipped: dict[str, str]) -> None:
 
 
 PRIVILEGED = (
-    "All variants here read ground truth of the simulator: names, poses and surface points of objects and parts. All but "
-    "'centroid' also use grasps and places computed on it. Programs are written by rules, not by a language model."
+    "All variants here read ground truth of the simulator: names, poses and surface points of objects and parts. All "
+    "but 'centroid' also use grasps and places computed on it. Programs are written by rules, not by a language model."
 )
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from vecenv_eval.policies.voxposer import VoxPoserPolicy
+
 from voxposer.agent import AgentConfig
 
 

@@ -6,10 +6,11 @@ In: a view of the scene, and the pose that the hand is to reach. Out: a path of 
 * avoidance: the room around the hand and its load at every voxel (``vecenv.manipulation.rooms``), once as the hand is
   rotated at the start and once as at the goal, plus what the program wants to avoid, as a price per metre;
 * rotation: the start's in the zone that the hand must leave before it has room to turn, the goal's elsewhere;
-* affordance: the cost to go to the goal over those prices (``voxposer.planning.cost_to_go``), which has no other minimum.
+* affordance: the cost to go to the goal over those prices (``voxposer.planning.cost_to_go``), which has no other
+  minimum.
 
-Voxels are 1 cm wide and a grasp leaves a few millimetres, so the maps' voxels are moved to have one exactly at the start
-and, outside that zone, one exactly at the goal.
+Voxels are 1 cm wide and a grasp leaves a few millimetres, so the maps' voxels are moved to have one exactly at the
+start and, outside that zone, one exactly at the goal.
 """
 
 from __future__ import annotations

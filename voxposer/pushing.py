@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from vecenv.errors import VecenvError
+from vecenv.manipulation.reach import PandaArm
 from vecenv.manipulation.routes import Stop
 from voxposer.perception.view import Perception
 from voxposer.planning.push import Push, PushConfig, best_push, push_waypoints
@@ -279,7 +280,18 @@ def _fits(
         between = _raised(contacts[free] - share * distance * ahead[free], lowest)
         hit[free] = _meets(others, between, hands[free], config.body[:1], 0.0)
     reach = config.reach - config.slanted_reach * max(np.sin(slant), 0.0)
-    return ~hit & (np.linalg.norm((begin - perception.base)[:, :2], axis=1) < reach)
+    fits = ~hit & (np.linalg.norm((begin - perception.base)[:, :2], axis=1) < reach)
+    fits[fits] = _reached(perception, begin[fits], hands[fits])
+    return fits
+
+
+def _reached(perception: Perception, positions: np.ndarray, hands: np.ndarray) -> np.ndarray:
+    """Whether the arm has joint angles for hands at positions [M, 3], [M, 3, 3]; one a 2 cm cell is tried."""
+    base = perception.snapshot.panda_base
+    if base is None or not len(positions):
+        return np.ones(len(positions), bool)
+    _, first, cell = np.unique(np.round(positions / 0.02).astype(int), axis=0, return_index=True, return_inverse=True)
+    return PandaArm(base).reaches(positions[first], hands[first])[cell.ravel()]
 
 
 def _raised(points: np.ndarray, lowest: float) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Room around a hand, and what it carries, at every node of a lattice of its positions: a configuration-space map.
 
-The solids of a hand (:func:`hand_solids`, :func:`load_solids`), its rotation and obstacle points come in. Out comes, for
-each position of the grip site on a :class:`Lattice`, the smallest distance between the solids and an obstacle, negative
-where they overlap (:func:`room_map`). :func:`dense_surface` fills the gaps between sparse surface samples.
+The solids of a hand (:func:`hand_solids`, :func:`load_solids`), its rotation and obstacle points come in. Out comes,
+for each position of the grip site on a :class:`Lattice`, the smallest distance between the solids and an obstacle,
+negative where they overlap (:func:`room_map`). :func:`dense_surface` fills the gaps between sparse surface samples.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from scipy.spatial import cKDTree
 from vecenv.manipulation.grasps import Gripper
 from vecenv.observations import PointCloud
 from vecenv.util.compiled import compile_function
-
 
 # Hands whose axis has at most this vertical component point down.
 _UPRIGHT = -0.98
@@ -134,8 +133,9 @@ def room_map(
         margin: room beyond this is not told apart.
 
     Returns:
-        float32 [lattice.shape], metres: the largest coordinate difference, in a solid's axes, between it and the nearest
-        obstacle; at most ``margin``, negative where an obstacle is inside. Coarse solids count within half of ``margin``.
+        float32 [lattice.shape], metres: the largest coordinate difference, in a solid's axes, between it and the
+        nearest obstacle; at most ``margin``, negative where an obstacle is inside. Coarse solids count within half of
+        ``margin``.
     """
     room = np.full(lattice.shape, margin, np.float32)
     # Below the highest obstacle of a column others say nothing more about a palm that comes from above.

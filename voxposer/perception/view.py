@@ -249,7 +249,7 @@ class Perception:
         return LazyObservation(values, later)
 
     def _centroid_fields(self, points: np.ndarray) -> tuple[Callable[[], HandPose], Callable[[], HandPose]]:
-        """Grasp and place without geometry: an upright hand at the centroid, and with its load on the middle of the top.
+        """Grasp and place without geometry: an upright hand at the centroid; its load on the middle of the top.
 
         Args:
             points: surface of the object or part, [N, 3].
