@@ -6,13 +6,14 @@ that ``voxposer.planning.plan`` turns into waypoints.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
 
 from vecenv.manipulation.routes import RouteConfig, Stop, planned_route, travel_route, work_route
 from vecenv.manipulation.world import matrix
-from voxposer.mapped import plan_mapped
+from voxposer.mapped import OutOfReach, plan_mapped
 from voxposer.paths import is_contact_motion
 from voxposer.perception.view import Perception
 from voxposer.planning.config import PlannerConfig
@@ -61,7 +62,9 @@ def travel(stops: list[Stop], perception: Perception, route: RouteConfig) -> lis
     if route.mode == "planned":
         return planned_route(stops, route)
     if route.mode == "map":
-        return _mapped(stops[0], stops[-1], perception, route)
+        # No program asked for such a motion, so none is told: the arm goes over the scene as near as it can.
+        with contextlib.suppress(OutOfReach):
+            return _mapped(stops[0], stops[-1], perception, route)
     axes = matrix(stops[0].quat)[:, 2], matrix(stops[-1].quat)[:, 2]
     held = perception.held if stops[0].closed else ""
     return travel_route(stops, axes, perception.scene, held, route)
