@@ -107,8 +107,8 @@ class Contacts:
         """Count the contacts of the present state in the slots that are about to move."""
         del actions
         state, index = self._env.state(), self._env.scene_index
-        for slot in np.flatnonzero(active):
-            met = self._met(self._env.mj_models[index[slot]], state.qpos[slot], self._own[slot])
+        for slot in np.flatnonzero(active).tolist():
+            met = self._met(self._env.mj_models[int(index[slot])], state.qpos[slot], self._own[slot])
             self.ticks[slot] += bool(met)
             self.touched[slot] |= met
 
@@ -118,9 +118,9 @@ class Contacts:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
-        carried, met = own[0], set()
+        carried, met = own[0], set[str]()
         for one, other in data.contact.geom[: data.ncon]:
-            pair = {owner[one], owner[other]}
+            pair = {str(owner[one]), str(owner[other])}
             if pair & {"robot", carried}:
                 met |= pair - {"robot", "", *own}
         return met

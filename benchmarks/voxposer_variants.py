@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from vecenv_eval.policies.voxposer import VoxPoserPolicy
 
@@ -75,7 +76,8 @@ class VariantPolicy(VoxPoserPolicy):
     """
 
     def __init__(self, variant: str = "shipped") -> None:
-        super().__init__(**ARGUMENTS.get(variant, {}))
+        arguments: dict[str, Any] = dict(ARGUMENTS.get(variant, {}))
+        super().__init__(**arguments)
         self.name = f"{self.name}, {variant}"
         if variant in VARIANTS:
             self.config = VARIANTS[variant].change(self.config)

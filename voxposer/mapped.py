@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from vecenv.manipulation import rooms
@@ -115,16 +115,18 @@ def plan_mapped(
         )
     ]
     free = np.minimum(np.minimum(leaving, coming), turning) >= route.turning
-    cost, found = flood(prices[0], lattice.step, start, free)
-    zone = cost < found if np.isfinite(found) else np.isfinite(cost) & (leaving > coming)
+    cost, cheapest = flood(prices[0], lattice.step, start, free)
+    zone = cost < cheapest if np.isfinite(cheapest) else np.isfinite(cost) & (leaving > coming)
     price, room = np.where(zone, prices[0], prices[1]), np.where(zone, leaving, coming)
+    found = None
     for _ in range(_REPLANS + 1):
         value = cost_to_go(price, lattice.step, end, start)
         found = _followed(perception, goal, value, zone, room, (at_start, at_goal), start, planner)
         beyond = _out_of_reach(perception, found, start_rotation, goal_rotation)
         if not len(beyond):
-            return found
+            break
         price = price + route.hit_price * _near_any(lattice, beyond)
+    assert found is not None
     return found
 
 
@@ -149,9 +151,7 @@ def _out_of_reach(perception: Perception, found: MappedPath, first: np.ndarray, 
 def _near_any(lattice: Lattice, places: np.ndarray) -> np.ndarray:
     """Which nodes of a lattice are near some places [K, 3], bool [X, Y, Z]."""
     nodes = np.stack(np.meshgrid(*(np.arange(n) for n in lattice.shape), indexing="ij"), axis=-1)
-    far = cKDTree(places).query((lattice.origin + nodes * lattice.step).reshape(-1, 3), distance_upper_bound=_AVOIDED)[
-        0
-    ]
+    far = KDTree(places).query((lattice.origin + nodes * lattice.step).reshape(-1, 3), distance_upper_bound=_AVOIDED)[0]
     return np.isfinite(far).reshape(lattice.shape)
 
 

@@ -77,7 +77,7 @@ def _mapped(
     """The path of a request over configuration-space maps; where it turns is kept in the view."""
     perception = interface.perception
     here = perception.grid.voxel(perception.ee.pos)
-    ends = np.argwhere(request.targets)
+    ends = np.argwhere(np.asarray(request.targets))
     end = ends[int(np.linalg.norm(ends - here, axis=1).argmin())]
     goal = Stop(perception.position_of(end), request.rotation_at(end), request.closed_at_end(end))
     closed = perception.closed and request.closed_at(here)
@@ -93,7 +93,7 @@ def _mapped(
 
 def straight_path(start: np.ndarray, request: MotionRequest, config: PlannerConfig) -> np.ndarray:
     """A straight line over voxels [P, 3] to the nearest target; an object that is pushed keeps its height."""
-    targets = np.argwhere(request.targets)
+    targets = np.argwhere(np.asarray(request.targets))
     end = targets[int(np.linalg.norm(targets - start, axis=1).argmin())].astype(float)
     end[2] = start[2] if request.object_centric else end[2]
     count = max(int(np.linalg.norm(end - start)), 1)

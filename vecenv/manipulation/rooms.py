@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vecenv.manipulation.grasps import Gripper
 from vecenv.observations import PointCloud
@@ -167,11 +167,12 @@ def dense_surface(cloud: PointCloud, pitch: float = 0.011) -> np.ndarray:
     points, normals = cloud.points, cloud.normals
     if len(points) <= _NEIGHBOURS:
         return points
-    far, near = cKDTree(points).query(points, k=_NEIGHBOURS + 1)
-    spacing = float(np.median(far[:, 6])) * np.sqrt(np.pi / 6)
+    far, near = KDTree(points).query(points, k=_NEIGHBOURS + 1)
+    spacing = float(np.median(np.asarray(far)[:, 6])) * np.sqrt(np.pi / 6)
     if spacing < pitch:
         return points
-    first, last, apart = np.repeat(np.arange(len(points)), _NEIGHBOURS), near[:, 1:].ravel(), far[:, 1:].ravel()
+    first, last = np.repeat(np.arange(len(points)), _NEIGHBOURS), np.asarray(near)[:, 1:].ravel()
+    apart = np.asarray(far)[:, 1:].ravel()
     way = points[last] - points[first]
     level = np.abs(np.einsum("ij,ij->i", way, normals[first])) < 0.15 * apart + 0.001
     alike = np.einsum("ij,ij->i", normals[first], normals[last]) > 0.9
