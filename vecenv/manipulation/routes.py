@@ -58,7 +58,7 @@ class RouteConfig:
         ValueError: there is no such mode.
     """
 
-    mode: RouteMode = "raised"
+    mode: RouteMode = "map"
     over: float = 0.03
     corridor: float = 0.11
     approach: float = 0.06
