@@ -91,43 +91,95 @@ def plan_mapped(
     Raises:
         OutOfReach: the arm cannot take the goal.
     """
-    grid = perception.grid
-    held = perception.held if closed else ""
-    scene = _Surroundings(perception, held, closed, route)
-    start_rotation, goal_rotation = perception.ee.rotation, matrix(goal.quat)
-    step = grid.resolution * grid.size / (grid.size - 1)
-    lattice = Lattice(grid.lo, step * [1, 1, _LAYERS], (grid.size, grid.size, -(-grid.size // _LAYERS)))
-    at_start, at_goal = _anchored(lattice, perception.ee.pos), _anchored(lattice, goal.pos)
-    start, end = at_start.index(perception.ee.pos), at_goal.index(goal.pos)
-    here, there = (perception.ee.pos, start_rotation), (goal.pos, goal_rotation)
-    leaving = scene.room(at_start, start_rotation, here)
-    coming = scene.room(at_goal, goal_rotation, there if exact else here)
-    if not exact and coming[end] < 0:
-        end = _freed(at_goal, end, coming, route)
-        goal = replace(goal, pos=at_goal.origin + np.array(end) * at_goal.step)
-    turning = _while_turning(scene, at_goal, here, goal_rotation, coming)
-    extra = np.zeros(lattice.shape, np.float32) if avoidance is None else avoidance[:, :, ::_LAYERS]
-    prices = [
-        _price(room if held else _with_own_axis(room, at, pose, rotation, route), extra, route)
-        for room, at, pose, rotation in (
-            (leaving, at_start, perception.ee.pos, start_rotation),
-            (coming, at_goal, goal.pos, goal_rotation),
-        )
-    ]
-    free = np.minimum(np.minimum(leaving, coming), turning) >= route.turning
-    cost, cheapest = flood(prices[0], lattice.step, start, free)
-    zone = cost < cheapest if np.isfinite(cheapest) else np.isfinite(cost) & (leaving > coming)
-    price, room = np.where(zone, prices[0], prices[1]), np.where(zone, leaving, coming)
-    found = None
+    maps = _maps(perception, goal, closed=closed, avoidance=avoidance, route=route, exact=exact)
+    found, price = None, maps.price
     for _ in range(_REPLANS + 1):
-        value = cost_to_go(price, lattice.step, end, start)
-        found = _followed(perception, goal, value, zone, room, (at_start, at_goal), start, planner)
-        beyond = _out_of_reach(perception, found, start_rotation, goal_rotation)
+        value = cost_to_go(price, maps.lattices[0].step, maps.end, maps.start)
+        found = _followed(perception, maps, value, planner)
+        beyond = _out_of_reach(perception, found, *maps.rotations)
         if not len(beyond):
             break
-        price = price + route.hit_price * _near_any(lattice, beyond)
+        price = price + route.hit_price * _near_any(maps.lattices[0], beyond)
     assert found is not None
     return found
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """The maps of a motion.
+
+    Attributes:
+        lattices: with a node exactly at the start, and with one exactly at the goal.
+        rotations: of the hand at the start and at the goal, [3, 3] each.
+        start, end: the nodes of start and goal.
+        goal: position of the goal, [3].
+        zone: where the hand has the start's rotation, and the start's lattice counts, bool [X, Y, Z].
+        room: around hand and load, metres, float32 [X, Y, Z].
+        price: of a metre, float32 [X, Y, Z].
+    """
+
+    lattices: tuple[Lattice, Lattice]
+    rotations: tuple[np.ndarray, np.ndarray]
+    start: tuple[int, int, int]
+    end: tuple[int, int, int]
+    goal: np.ndarray
+    zone: np.ndarray
+    room: np.ndarray
+    price: np.ndarray
+
+
+def _maps(
+    perception: Perception,
+    goal: Stop,
+    *,
+    closed: bool,
+    avoidance: np.ndarray | None,
+    route: RouteConfig,
+    exact: bool,
+) -> _Maps:
+    """The maps of a motion; see :func:`plan_mapped`."""
+    held = perception.held if closed else ""
+    scene = _Surroundings(perception, held, closed, route)
+    here, there = (perception.ee.pos, perception.ee.rotation), (goal.pos, matrix(goal.quat))
+    lattice = _lattice(perception)
+    at_start, at_goal = _anchored(lattice, here[0]), _anchored(lattice, there[0])
+    start, end = at_start.index(here[0]), at_goal.index(there[0])
+    leaving = scene.room(at_start, here[1], here)
+    coming = scene.room(at_goal, there[1], there if exact else here)
+    if not exact and coming[end] < 0:
+        end = _freed(at_goal, end, coming, route)
+        there = (at_goal.origin + np.array(end) * at_goal.step, there[1])
+    turning = _while_turning(scene, at_goal, here, there[1], coming)
+    extra = np.zeros(lattice.shape, np.float32) if avoidance is None else avoidance[:, :, ::_LAYERS]
+    leave, come = (
+        _price(room if held else _with_own_axis(room, at, *pose, route), extra, route)
+        for room, at, pose in ((leaving, at_start, here), (coming, at_goal, there))
+    )
+    free = np.minimum(np.minimum(leaving, coming), turning) >= route.turning
+    cost, cheapest = flood(leave, lattice.step, start, free)
+    zone = cost < cheapest if np.isfinite(cheapest) else np.isfinite(cost) & (leaving > coming)
+    return _Maps(
+        lattices=(at_start, at_goal),
+        rotations=(here[1], there[1]),
+        start=start,
+        end=end,
+        goal=there[0],
+        zone=zone,
+        room=np.where(zone, leaving, coming),
+        price=np.where(zone, leave, come),
+    )
+
+
+def _lattice(perception: Perception) -> Lattice:
+    """The lattice on the centres of the view's voxels."""
+    grid = perception.grid
+    return Lattice(grid.lo, _voxel(perception) * [1, 1, _LAYERS], (grid.size, grid.size, -(-grid.size // _LAYERS)))
+
+
+def _voxel(perception: Perception) -> np.ndarray:
+    """Distances of the centres of voxels, metres, [3]."""
+    grid = perception.grid
+    return (grid.hi - grid.lo) / (grid.size - 1)
 
 
 def _out_of_reach(perception: Perception, found: MappedPath, first: np.ndarray, last: np.ndarray) -> np.ndarray:
@@ -237,33 +289,28 @@ def _price(room: np.ndarray, avoided: np.ndarray, route: RouteConfig) -> np.ndar
     return (price + route.hit_price * avoided).astype(np.float32)
 
 
-def _followed(
-    perception: Perception,
-    goal: Stop,
-    value: np.ndarray,
-    zone: np.ndarray,
-    room: np.ndarray,
-    lattices: tuple[Lattice, Lattice],
-    start: tuple[int, int, int],
-    planner: PlannerConfig,
-) -> MappedPath:
+def _followed(perception: Perception, maps: _Maps, value: np.ndarray, planner: PlannerConfig) -> MappedPath:
     """The planner's descent of a value map, from voxels to positions."""
     grid = perception.grid
-    full = np.repeat(value, _LAYERS, axis=2)[:, :, : grid.size].astype(float)
-    full[:, :, 1:-1:_LAYERS] = (full[:, :, 0:-2:_LAYERS] + full[:, :, 2::_LAYERS]) / 2
-    most = float(value[start]) or 1.0
-    full = np.where(np.isfinite(full), full / most, 2.0 + np.zeros_like(full))
-    first = np.array(start) * [1, 1, _LAYERS]
+    full = _every_layer(value, value[maps.start], grid.size)
     # The goal costs 0, and what is next to it little in comparison with a way that has to touch something.
     window = min(planner.savgol_window_size, _WINDOW)
+    first = np.array(maps.start) * [1, 1, _LAYERS]
     _, path = descend_value(first, full, replace(planner, savgol_window_size=window, stop_threshold=0.0))
     nodes = np.clip(np.round(path / [1, 1, _LAYERS]), 0, np.array(value.shape) - 1).astype(int)
-    inside = zone[tuple(nodes.T)]
+    inside = maps.zone[tuple(nodes.T)]
     turn = int(np.flatnonzero(inside)[-1]) + 1 if inside.any() else 0
     share = np.clip((np.arange(len(path)) - turn + 1) / _BLEND, 0, 1)[:, None]
-    step = grid.resolution * grid.size / (grid.size - 1)
-    shifts = [(lattice.origin - grid.lo) / step for lattice in lattices]
+    step = _voxel(perception)
+    shifts = [(lattice.origin - grid.lo) / step for lattice in maps.lattices]
     moved = path + (1 - share) * shifts[0] + share * shifts[1]
     moved[0] = (perception.ee.pos - grid.lo) / step
-    moved = np.concatenate([moved, ((goal.pos - grid.lo) / step)[None]])
-    return MappedPath(moved, turn, full, float(room[tuple(nodes.T)].min()))
+    moved = np.concatenate([moved, ((maps.goal - grid.lo) / step)[None]])
+    return MappedPath(moved, turn, full, float(maps.room[tuple(nodes.T)].min()))
+
+
+def _every_layer(value: np.ndarray, most: float, size: int) -> np.ndarray:
+    """Costs to go at all voxels, 1 at the start and 2 where none is known, float64 [N, N, N]."""
+    full = np.repeat(value, _LAYERS, axis=2)[:, :, :size].astype(float)
+    full[:, :, 1:-1:_LAYERS] = (full[:, :, 0:-2:_LAYERS] + full[:, :, 2::_LAYERS]) / 2
+    return np.where(np.isfinite(full), full / (float(most) or 1.0), 2.0)
