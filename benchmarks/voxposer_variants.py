@@ -1,6 +1,6 @@
 """VoxPoser with one part replaced: the policy behind the ablation and the clutter benchmark.
 
-The name of a variant comes in; a policy of the harness goes out whose options differ from the shipped ones in public
+The name of a variant comes in; a policy of the harness goes out whose options differ from the defaults in public
 config fields alone. :data:`VARIANTS` has each variant's changes and a sentence about it.
 """
 
@@ -37,14 +37,14 @@ def _centroid(config: AgentConfig) -> AgentConfig:
 
 
 VARIANTS: Mapping[str, Variant] = {
-    "shipped": Variant("the defaults", lambda config: config),
+    "map": Variant(
+        "the default: configuration-space maps, and the planner's path followed as it is, route.mode='map'",
+        _route("map"),
+    ),
     "raised": Variant("the hand rerouted over surface points, route.mode='raised'", _route("raised")),
     "raised-straight": Variant(
         "the same with straight lines in place of the planner, planner.method='straight'",
         lambda config: _straight(_route("raised")(config)),
-    ),
-    "map": Variant(
-        "configuration-space maps, and the planner's path followed as it is, route.mode='map'", _route("map")
     ),
     "planned": Variant(
         "upstream's maps, and the planner's path followed as it is, route.mode='planned'", _route("planned")
@@ -53,7 +53,10 @@ VARIANTS: Mapping[str, Variant] = {
         "straight lines in place of the planner, followed as they are",
         lambda config: _straight(_route("planned")(config)),
     ),
-    "centroid": Variant("no grasp and place fields: centroids, perception.fields='centroid'", _centroid),
+    "centroid": Variant(
+        "rerouted, without grasp and place fields: centroids, perception.fields='centroid'",
+        lambda config: _centroid(_route("raised")(config)),
+    ),
 }
 # Variants whose option may not exist yet, and the argument of the policy that selects them.
 ARGUMENTS: Mapping[str, Mapping[str, str]] = {"camera": {"perception": "camera"}}
@@ -75,7 +78,7 @@ class VariantPolicy(VoxPoserPolicy):
         variant: its name.
     """
 
-    def __init__(self, variant: str = "shipped") -> None:
+    def __init__(self, variant: str = "map") -> None:
         arguments: dict[str, Any] = dict(ARGUMENTS.get(variant, {}))
         super().__init__(**arguments)
         self.name = f"{self.name}, {variant}"
