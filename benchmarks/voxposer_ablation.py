@@ -26,7 +26,7 @@ from voxposer_variants import ARGUMENTS, VARIANTS, why_missing
 
 SUITES = ("libero_object", "libero_spatial", "libero_goal", "libero_10")
 # What a variant reads of the simulator beyond images and joints.
-POSES, FIELDS = "names, poses, surfaces", "grasp and place geometry"
+POSES, FIELDS = "poses and surfaces", "grasps and places"
 
 
 def main() -> None:
