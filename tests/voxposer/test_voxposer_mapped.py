@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -268,8 +269,8 @@ def test_a_hand_without_a_program_takes_the_maps_way_too() -> None:
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: RouteConfig(**{"mode": "bent"}), "mode must be one of raised, planned, map, got 'bent'"),
-        (lambda: PerceptionConfig(**{"fields": "none"}), "fields must be 'geometry' or 'centroid', got 'none'"),
+        (lambda: cast(Any, RouteConfig)(mode="bent"), "mode must be one of raised, planned, map, got 'bent'"),
+        (lambda: cast(Any, PerceptionConfig)(fields="none"), "fields must be 'geometry' or 'centroid', got 'none'"),
     ],
 )
 def test_options_that_do_not_exist_are_refused(make: object, says: str) -> None:
