@@ -310,6 +310,7 @@ class ObjectsSnapshot:
         targets: objects of interest of the task (``obj_of_interest``).
         movable: the names that are not fixed to the world.
         parts: name -> part of one of them; LIBERO's are named as ``vecenv.libero.scene.parts`` says.
+        panda_base: pose of the base of a Panda, xyz + wxyz, [7]; None for another robot.
     """
 
     names: tuple[str, ...]
@@ -324,6 +325,7 @@ class ObjectsSnapshot:
     targets: tuple[str, ...] = ()
     movable: tuple[str, ...] = ()
     parts: Mapping[str, Part] = field(default_factory=dict)
+    panda_base: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -82,13 +82,12 @@ class MapView:
 def map_views(motion: PlannedMotion, config: PlannerConfig) -> list[MapView]:
     """The maps that a motion was planned on: value, avoidance, rotation, gripper and velocity.
 
-    The value is what a voxel costs the planner: 0 at the best, 1 at the worst.
+    The value is what a voxel costs the planner: 0 at the best, 1 at the worst, or at the start for a cost to go.
     """
     request, grid = motion.request, motion.perception.grid
     value, avoidance = None, None
     if motion.obstacles is not None and request.targets is not None:
-        with jax.enable_x64(True):
-            value = np.asarray(cost_map(jnp.asarray(request.targets), jnp.asarray(motion.obstacles, float), config))
+        value = motion.value if motion.value is not None else _upstreams(request.targets, motion.obstacles, config)
         avoidance = motion.obstacles if motion.obstacles.any() else None
     unplanned = {"home": "not planned: the hand goes home", "stay": "not planned: the hand stays"}.get(request.kind, "")
     nothing = "nothing: the hand pushes or pulls, and no program says otherwise"
@@ -105,6 +104,12 @@ def map_views(motion: PlannedMotion, config: PlannerConfig) -> list[MapView]:
         MapView("gripper (1 open)", request.gripper if request.gripper.ndim else None, (0, 1), "Blues", grip),
         MapView("velocity", request.velocity if request.velocity.ndim else None, (0, 1), "Plasma", speed),
     ]
+
+
+def _upstreams(targets: np.ndarray, obstacles: np.ndarray, config: PlannerConfig) -> np.ndarray:
+    """Upstream's cost map, [N, N, N]."""
+    with jax.enable_x64(True):
+        return np.asarray(cost_map(jnp.asarray(targets), jnp.asarray(obstacles, float), config))
 
 
 def _turned(quats: np.ndarray, hand: np.ndarray) -> np.ndarray:

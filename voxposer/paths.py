@@ -8,11 +8,13 @@ not given has no effect.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from vecenv.manipulation.routes import RouteConfig, is_contact_move
+from vecenv.manipulation.routes import RouteConfig, Stop, is_contact_move
 from voxposer.interface import Interface
+from voxposer.mapped import MappedPath, plan_mapped
 from voxposer.perception.view import Perception
 from voxposer.planning import maps
 from voxposer.planning.config import Fault, PlannerConfig
@@ -23,28 +25,52 @@ from voxposer.requests import InterfaceError, MotionRequest
 CHUNK = 8
 
 
+class PlannedOn(NamedTuple):
+    """The maps that a path was planned on, [N, N, N] each.
+
+    Attributes:
+        obstacles: what is kept away from, 0 to 1.
+        value: the affordance map of ``route.mode="map"``, cost to go; None for upstream's, which follows from the
+            targets and the obstacles.
+    """
+
+    obstacles: np.ndarray
+    value: np.ndarray | None = None
+
+
 def plan_paths(
     wants: Sequence[tuple[Interface, MotionRequest]],
     config: PlannerConfig,
     route: RouteConfig,
-    obstacles: dict[int, np.ndarray] | None = None,
+    maps_of: dict[int, PlannedOn] | None = None,
 ) -> list[np.ndarray | InterfaceError]:
     """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path.
 
-    The obstacle maps [N, N, N] that paths were planned on are put into ``obstacles``, if given, by index of request.
+    The maps that paths were planned on are put into ``maps_of``, if given, by index of request.
     """
+    kept: dict[int, PlannedOn] = {} if maps_of is None else maps_of
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
     jointed = [i for i, (interface, request) in enumerate(wants) if hangs_on_joint(interface.perception, request)]
     for i in jointed:
         paths[i] = np.stack([wants[i][1].start, nearest_target(wants[i][1])]).astype(float)
     asking = [i for i, (_, request) in enumerate(wants) if request.targets is not None and i not in jointed]
+    if route.mode == "map" and config.method == "greedy":
+        for i in list(asking):
+            try:
+                if not travels(*wants[i], route):
+                    continue
+                found = _mapped(*wants[i], config, route)
+                paths[i], kept[i] = found.path, PlannedOn(found.avoidance, found.value)
+            except InterfaceError as error:
+                paths[i] = error
+            asking.remove(i)
     for first in range(0, len(asking), CHUNK):
         chunk = asking[first : first + CHUNK]
-        maps_of, refused = _obstacle_maps([wants[i] for i in chunk], route)
-        for i, path in zip(chunk, _planned([wants[i] for i in chunk], maps_of, refused, config), strict=True):
+        obstacles, refused = _obstacle_maps([wants[i] for i in chunk], route)
+        for i, path in zip(chunk, _planned([wants[i] for i in chunk], obstacles, refused, config), strict=True):
             paths[i] = path
-        if obstacles is not None:
-            obstacles |= dict(zip(chunk, maps_of, strict=True))
+        if maps_of is not None:
+            kept |= {i: PlannedOn(each) for i, each in zip(chunk, obstacles, strict=True)}
     return paths
 
 
@@ -54,6 +80,9 @@ def _planned(
     refused: Mapping[int, InterfaceError],
     config: PlannerConfig,
 ) -> list[np.ndarray | InterfaceError]:
+    if config.method == "straight":
+        straight = [straight_path(start_of(*want), want[1], config) for want in wants]
+        return [refused.get(i, path) for i, path in enumerate(straight)]
     padded = [*wants, *[wants[-1]] * ((1 if len(wants) == 1 else CHUNK) - len(wants))]
     starts = np.stack([start_of(interface, request) for interface, request in padded])
     obstacles = [*obstacles, *[obstacles[-1]] * (len(padded) - len(wants))]
@@ -99,6 +128,40 @@ def nearest_target(request: MotionRequest) -> np.ndarray:
     """The target voxel that is nearest to the start of a motion, [3]."""
     found = np.argwhere(np.asarray(request.targets))
     return found[int(np.linalg.norm(found - request.start, axis=1).argmin())]
+
+
+def travels(interface: Interface, request: MotionRequest, route: RouteConfig) -> bool:
+    """Whether a request moves the hand through the scene, neither pushing nor pulling."""
+    return not request.object_centric and not is_contact_motion(interface.perception, request, route)
+
+
+def _mapped(interface: Interface, request: MotionRequest, config: PlannerConfig, route: RouteConfig) -> MappedPath:
+    """The path of a request over configuration-space maps; where it turns is kept in the view.
+
+    Raises:
+        OutOfReach: the arm cannot take the goal.
+    """
+    perception = interface.perception
+    here = perception.grid.voxel(perception.ee.pos)
+    ends = np.argwhere(np.asarray(request.targets))
+    end = ends[int(np.linalg.norm(ends - here, axis=1).argmin())]
+    goal = Stop(perception.position_of(end), request.rotation_at(end), request.closed_at_end(end))
+    closed = perception.closed and request.closed_at(here)
+    options = {"avoidance": request.avoidance, "planner": config, "route": route}
+    exact = tuple(int(index) for index in end) in perception.exact
+    found = plan_mapped(perception, goal, closed=closed, exact=exact, **options)
+    perception.turns[request] = found.turn
+    return found
+
+
+def straight_path(start: np.ndarray, request: MotionRequest, config: PlannerConfig) -> np.ndarray:
+    """A straight line over voxels [P, 3] to the nearest target; an object that is pushed keeps its height."""
+    targets = np.argwhere(np.asarray(request.targets))
+    end = targets[int(np.linalg.norm(targets - start, axis=1).argmin())].astype(float)
+    end[2] = start[2] if request.object_centric else end[2]
+    count = max(int(np.linalg.norm(end - start)), 1)
+    path = start + np.linspace(0, 1, count + 1)[:, None] * (end - start)
+    return np.concatenate([path[:: config.pushing_skip_per_k], path[-1:]])[1:] if request.object_centric else path
 
 
 def start_of(interface: Interface, request: MotionRequest) -> np.ndarray:

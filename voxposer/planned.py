@@ -29,6 +29,8 @@ class PlannedMotion:
         start: where the hand was taken to be, xyz + wxyz, world frame, [7].
         closed: whether its grip was taken to be closed.
         calls: the subtask's questions to the model, as a range of the slot's trace.
+        value: the affordance map that was descended, cost to go, [N, N, N]; None where it follows from targets and
+            obstacles, as upstream's does.
     """
 
     slot: int
@@ -42,6 +44,7 @@ class PlannedMotion:
     start: np.ndarray = field(default_factory=lambda: np.zeros(7))
     closed: bool = False
     calls: range = range(0)
+    value: np.ndarray | None = None
 
 
 class Subtasks(NamedTuple):

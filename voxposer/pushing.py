@@ -19,6 +19,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from vecenv.errors import VecenvError
+from vecenv.manipulation.reach import PandaArm
 from vecenv.manipulation.routes import Stop
 from vecenv.observations import PointCloud
 from voxposer.joint_motion import JointMotion
@@ -378,7 +379,18 @@ def _fits(
     if name in perception.snapshot.parts:
         wrist = begin - perception.config.wrist_back * hands[:, :, 2] - perception.base
         hit |= np.linalg.norm(wrist[:, :2], axis=1) < perception.config.nearest
-    return ~hit & (np.linalg.norm((begin - perception.base)[:, :2], axis=1) < reach)
+    fits = ~hit & (np.linalg.norm((begin - perception.base)[:, :2], axis=1) < reach)
+    fits[fits] = _reached(perception, begin[fits], hands[fits])
+    return fits
+
+
+def _reached(perception: Perception, positions: np.ndarray, hands: np.ndarray) -> np.ndarray:
+    """Whether the arm has joint angles for hands at positions [M, 3], [M, 3, 3]; one a 2 cm cell is tried."""
+    base = perception.snapshot.panda_base
+    if base is None or not len(positions):
+        return np.ones(len(positions), bool)
+    _, first, cell = np.unique(np.round(positions / 0.02).astype(int), axis=0, return_index=True, return_inverse=True)
+    return PandaArm(base).reaches(positions[first], hands[first])[cell.ravel()]
 
 
 def _raised(points: np.ndarray, lowest: float) -> np.ndarray:

@@ -19,9 +19,9 @@ class InterfaceError(InvalidInput):
     """A program called a function with invalid arguments; the message says what is expected."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MotionRequest:
-    """One motion that a program asked for, its maps evaluated.
+    """One motion that a program asked for, its maps evaluated; equal only to itself.
 
     Attributes:
         kind: ``"path"`` (plan over maps), ``"stay"`` (no affordance: where the hand is) or ``"home"``.

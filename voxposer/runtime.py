@@ -33,7 +33,7 @@ from voxposer.language.llm import Llm
 from voxposer.language.lmp import build_lmps
 from voxposer.language.lmp_config import CONFIGS, Call, LmpConfig
 from voxposer.language.replies import LlmError
-from voxposer.paths import plan_paths
+from voxposer.paths import PlannedOn, plan_paths
 from voxposer.perception.config import HandState, PerceptionConfig
 from voxposer.perception.observation import PerceptionError
 from voxposer.perception.view import Perception
@@ -372,7 +372,7 @@ class Runtimes:
         waiting = [i for i, slot in enumerate(slots) if isinstance(slot.phase, Moving)]
         while waiting:
             wants = [(slots[i].interface, slots[i].requests[0]) for i in waiting]
-            kept: dict[int, np.ndarray] = {}
+            kept: dict[int, PlannedOn] = {}
             paths = plan_paths(wants, self.config.planner, self.config.route, kept if self._on_planned else None)
             for row, (i, path) in enumerate(zip(waiting, paths, strict=True)):
                 stops = self._plan_motion(i, slots[i], path, kept.get(row))
@@ -382,7 +382,7 @@ class Runtimes:
         return motions
 
     def _plan_motion(
-        self, row: int, slot: Slot, path: np.ndarray | InterfaceError, obstacles: np.ndarray | None
+        self, row: int, slot: Slot, path: np.ndarray | InterfaceError, maps: PlannedOn | None
     ) -> list[Stop]:
         """Stops of a slot's next motion; the hand is then taken to be at its end."""
         assert isinstance(slot.phase, Moving)
@@ -403,7 +403,8 @@ class Runtimes:
             return []
         if self._on_planned:
             number, text = slot.progress.number, slot.progress.text
-            shown = (np.asarray(path), tuple(stops), obstacles, start, slot.grip.closed, slot.latest.calls)
+            obstacles, value = maps or (None, None)
+            shown = (np.asarray(path), tuple(stops), obstacles, start, slot.grip.closed, slot.latest.calls, value)
             self._on_planned(PlannedMotion(row, number, text, request, perception, *shown))
         if request.object_centric:
             slot.enter(Pushing(push, rest))

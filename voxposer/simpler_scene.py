@@ -87,7 +87,7 @@ def widowx_config(passes: int = 3) -> AgentConfig:
     # Waypoints are left within 1 cm and 0.1 rad, and a hand tilted so far loses a spoon: 3 more ticks at each stop.
     plan = PlanConfig(hold_ticks=3, settle=3, full_speed=0.03)
     # High above the table's far side the hand cannot point down: the wrist ends at 1.79 rad.
-    route = RouteConfig(over=0.02, corridor=0.06, approach=0.03)
+    route = RouteConfig(mode="raised", over=0.02, corridor=0.06, approach=0.03)
     return AgentConfig(perception=perception, route=route, plan=plan, passes=passes, idle_ticks=10)
 
 

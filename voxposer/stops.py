@@ -6,12 +6,17 @@ that ``voxposer.planning.plan`` turns into waypoints.
 
 from __future__ import annotations
 
+import contextlib
+from dataclasses import replace
+
 import numpy as np
 
-from vecenv.manipulation.routes import RouteConfig, Stop, travel_route, work_route
+from vecenv.manipulation.routes import RouteConfig, Stop, planned_route, travel_route, work_route
 from vecenv.manipulation.world import matrix
+from voxposer.mapped import OutOfReach, plan_mapped
 from voxposer.paths import is_contact_motion
 from voxposer.perception.view import Perception
+from voxposer.planning.config import PlannerConfig
 from voxposer.quaternions import quaternion
 from voxposer.requests import MotionRequest
 
@@ -46,14 +51,31 @@ def stops_of(
     touching = is_contact_motion(perception, request, route)
     stops = along(request, path, perception)
     stops[0] = Stop(here.pos, here.quat, stops[0].closed, stops[0].velocity)
+    if route.mode == "map" and not touching:
+        turn = perception.turns.get(request, 0)
+        return planned_route([replace(s, quat=here.quat) if i < turn else s for i, s in enumerate(stops)], route)
     return work_route(stops, route) if touching else travel(stops, perception, route)
 
 
 def travel(stops: list[Stop], perception: Perception, route: RouteConfig) -> list[Stop]:
-    """Stops raised over the scene (``vecenv.manipulation.routes.travel_route``)."""
+    """The stops of a hand that travels: raised over the scene, or, as ``route.mode`` says, those of its path."""
+    if route.mode == "planned":
+        return planned_route(stops, route)
+    if route.mode == "map":
+        # No program asked for such a motion, so none is told: the arm goes over the scene as near as it can.
+        with contextlib.suppress(OutOfReach):
+            return _mapped(stops[0], stops[-1], perception, route)
     axes = matrix(stops[0].quat)[:, 2], matrix(stops[-1].quat)[:, 2]
     held = perception.held if stops[0].closed else ""
     return travel_route(stops, axes, perception.scene, held, route)
+
+
+def _mapped(here: Stop, goal: Stop, perception: Perception, route: RouteConfig) -> list[Stop]:
+    """The way of a hand to a pose that no program asked for, over configuration-space maps."""
+    found = plan_mapped(perception, goal, closed=here.closed, avoidance=None, planner=PlannerConfig(), route=route)
+    way = perception.grid.world(found.path[:-1])
+    stops = [replace(here, pos=at, quat=here.quat if i < found.turn else goal.quat) for i, at in enumerate(way)]
+    return planned_route([*stops, goal], route)
 
 
 def along(request: MotionRequest, path: np.ndarray, perception: Perception) -> list[Stop]:

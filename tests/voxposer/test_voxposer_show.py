@@ -76,8 +76,10 @@ def test_the_maps_are_those_that_were_planned_on() -> None:
     assert avoidance.values is motion.obstacles
     assert value.values is not None
     assert motion.request.targets is not None
-    target = tuple(np.argwhere(motion.request.targets)[0])
-    assert value.values[target] == pytest.approx(value.values.min(), abs=0.05)
+    assert value.values is motion.value
+    # The voxels of these maps are moved so that one is exactly at the goal.
+    target, best = np.argwhere(motion.request.targets)[0], np.argwhere(value.values == value.values.min())[0]
+    assert np.abs(target - best).max() <= 1
     assert gripper.constant == "open everywhere"
     assert velocity.constant == "1.00 of full speed everywhere"
     assert rotation.constant.startswith("wxyz 0.00, 1.00")

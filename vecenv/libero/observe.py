@@ -16,6 +16,7 @@ import numpy as np
 
 from vecenv.libero.config import LiberoError
 from vecenv.libero.physics.base import Group, Physics
+from vecenv.libero.robot import BASE_BODY
 from vecenv.libero.scene import surface
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.parts import PartSpec, opening, scene_parts
@@ -113,6 +114,7 @@ def _snapshot(
         targets=problem.obj_of_interest,
         movable=tuple(entity.name for entity in scene.objects),
         parts=parts,
+        panda_base=_body_pose(group, row, BASE_BODY),
     )
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from vecenv.manipulation.world import SceneGeometry, around
 
 # Hands whose axis has at most this vertical component point down.
 _UPRIGHT = -0.98
+# How a planned path becomes a route.
+RouteMode = Literal["raised", "planned", "map"]
 # Distances by which a hand moves an object aside from under an overhang, metres.
 _ASIDE = (0.02, 0.04, 0.06, 0.08, 0.10, 0.12)
 
@@ -28,6 +31,9 @@ class RouteConfig:
     """Distances that a hand keeps. Metres unless noted.
 
     Attributes:
+        mode: ``"raised"``: a hand that travels is rerouted over surface points, whatever the planner's path (this
+            module). ``"planned"``: it follows the planner's path. ``"map"``: it follows the planner's path over
+            configuration-space maps of hand and load (``voxposer.mapped``).
         over: vertical room over whatever lies on the way.
         corridor: half width of what counts as on the way.
         approach: the least distance from which a goal is approached along the hand's axis.
@@ -38,8 +44,21 @@ class RouteConfig:
         level: a closed, empty hand is in contact if its goal is higher or lower by at most this share of the distance
         work_reach: and at most this far away.
         step: distance of the samples at which obstacles on the way are looked for.
+        exact: a path that is followed as planned is thinned out to stops from which it deviates at most this much.
+        margin: in maps, room around hand and load beyond which more is no better.
+        turning: in maps, room with which a hand may turn.
+        touch: in maps, a hand that comes or goes along its own axis may be so far inside something: samples of surfaces
+            and voxels are not exact.
+        freed: in maps, a goal that is neither grasp nor place gives way to obstacles by at most this much.
+        near_price: in maps, price of a metre that touches something, beyond that of a free one, which is 1.
+        hit_price: in maps, price of a metre inside something or where the program wants none.
+        deep_price: in maps, price of a metre for each metre of depth inside something.
+
+    Raises:
+        ValueError: there is no such mode.
     """
 
+    mode: RouteMode = "map"
     over: float = 0.03
     corridor: float = 0.11
     approach: float = 0.06
@@ -50,6 +69,18 @@ class RouteConfig:
     level: float = 0.25
     work_reach: float = 0.35
     step: float = 0.03
+    exact: float = 0.003
+    margin: float = 0.035
+    turning: float = 0.012
+    touch: float = 0.006
+    freed: float = 0.12
+    near_price: float = 15.0
+    hit_price: float = 50.0
+    deep_price: float = 4000.0
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(RouteMode):
+            raise ValueError(f"mode must be one of {', '.join(get_args(RouteMode))}, got {self.mode!r}")
 
 
 @dataclass(frozen=True)
@@ -87,6 +118,12 @@ def is_contact_move(
 def work_route(stops: Sequence[Stop], config: RouteConfig = RouteConfig()) -> list[Stop]:
     """A path as planned, without redundant stops."""
     return [stops[i] for i in corners(np.array([stop.pos for stop in stops]), config.bend, _marks(stops))]
+
+
+def planned_route(stops: Sequence[Stop], config: RouteConfig = RouteConfig()) -> list[Stop]:
+    """A path exactly as planned: stops that lie on the lines between others are left out, and the first."""
+    kept = corners(np.array([stop.pos for stop in stops]), config.exact, _marks(stops))
+    return [stops[i] for i in kept if i] or [stops[-1]]
 
 
 def travel_route(

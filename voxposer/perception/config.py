@@ -7,6 +7,7 @@ fills in for each slot.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -38,6 +39,12 @@ class PerceptionConfig:
         edge: distance from the border of a place that the centre of what is put there keeps.
         home_reach: distance of the hand before the robot's base when an episode begins.
         map_size: voxels along each axis of the maps.
+        fields: what the grasp, place and push fields of an observation hold. ``"geometry"``: poses found by geometry
+            on ground-truth surface points and boxes. ``"centroid"``: what upstream's programs have to go by, the
+            middle of an object for a grasp, the middle of its top for a place, and the hand pointing down.
+
+    Raises:
+        ValueError: there are no such fields.
     """
 
     margins: Margins = field(default_factory=lambda: Margins(gripper=Gripper(wrist=0.14), grasp_tilts=(0.3, 0.6)))
@@ -56,10 +63,13 @@ class PerceptionConfig:
     edge: float = 0.03
     home_reach: float = 0.45
     map_size: int = MAP_SIZE
+    fields: Literal["geometry", "centroid"] = "geometry"
 
     def __post_init__(self) -> None:
         if self.map_size < LEAST_MAP_SIZE:
             raise ValueError(f"map_size must be at least {LEAST_MAP_SIZE}, not {self.map_size}")
+        if self.fields not in ("geometry", "centroid"):
+            raise ValueError(f"fields must be 'geometry' or 'centroid', got {self.fields!r}")
 
 
 @dataclass(frozen=True)

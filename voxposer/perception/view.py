@@ -10,9 +10,11 @@ program reads them.
 from __future__ import annotations
 
 import difflib
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -51,6 +53,8 @@ class Perception:
         exact: voxel -> world position [3] that was rounded to it, for every grasp and place read so far.
         targets: voxel -> name of the object that the grasp read there is for.
         closed: whether the hand is taken to be closed at :attr:`ee`.
+        turns: of motions that were planned over configuration-space maps, the waypoint from which the hand has the
+            rotation of the goal (``voxposer.mapped``).
     """
 
     def __init__(
@@ -73,6 +77,7 @@ class Perception:
         self._places: dict[str, HandPose] = {}
         self._ee = HandPose(snapshot.ee_pose[:3], matrix(snapshot.ee_pose[3:]))
         self.closed = hand.closed
+        self.turns: WeakKeyDictionary[object, int] = WeakKeyDictionary()
 
     # -- names ---------------------------------------------------------------------------------------------------------
 
@@ -202,8 +207,10 @@ class Perception:
         target = self._place_finder.of_part(part)
         observed = self._observation(name, part.cloud, lambda: self.grasp_finder.of_part(name, part), target)
         values: dict[str, Any] = {"normal": outward_direction(part, self.scene)}
-        if part.joint is not None and part.kind != "knob":
+        if part.joint is not None and part.kind != "knob" and self.config.fields == "geometry":
             values["push_quat"] = quaternion(self.grasp_finder.pushing_rotation(part))
+        elif part.joint is not None and part.kind != "knob":
+            values["push_quat"] = quaternion(upright(self.ee.rotation))
         if part.joint is not None:
             values |= {"axis": opening_direction(part), "is_open": part.joint.opened > 0.5 * part.joint.travel}
         return observed.updated(values)
@@ -227,17 +234,32 @@ class Perception:
             "_point_cloud_world": points,
         }
 
-        def place() -> HandPose:
-            return _once(self._places, name, lambda: self._place_finder.pose(points, target, self.held))
+        if self.config.fields == "centroid":
+            grasp, place = self._centroid_fields(points)
+        else:
+            place = functools.partial(self._place_finder.pose, points, target, self.held)
 
         later: dict[str, Callable[[], Any]] = {
             "occupancy_map": lambda: self.grid.occupancy(points).astype(float),
             "grasp_position": lambda: self._remember_voxel(_once(self._grasps, name, grasp), name),
             "grasp_quat": lambda: quaternion(_once(self._grasps, name, grasp).rotation),
-            "place_position": lambda: self._remember_voxel(place()),
-            "place_quat": lambda: quaternion(place().rotation),
+            "place_position": lambda: self._remember_voxel(_once(self._places, name, place)),
+            "place_quat": lambda: quaternion(_once(self._places, name, place).rotation),
         }
         return LazyObservation(values, later)
+
+    def _centroid_fields(self, points: np.ndarray) -> tuple[Callable[[], HandPose], Callable[[], HandPose]]:
+        """Grasp and place without geometry: an upright hand at the centroid; its load on the middle of the top.
+
+        Args:
+            points: surface of the object or part, [N, 3].
+        """
+        rotation, hangs = upright(self.ee.rotation), np.zeros(3)
+        if self.held:
+            load = self._surface(self.held).points
+            hangs = self.ee.pos - np.append((load.min(axis=0) + load.max(axis=0))[:2] / 2, load[:, 2].min())
+        top = np.append((points.min(axis=0) + points.max(axis=0))[:2] / 2, points[:, 2].max())
+        return lambda: HandPose(points.mean(axis=0), rotation), lambda: HandPose(top + hangs, rotation)
 
     def _remember_voxel(self, pose: HandPose, grasped: str = "") -> np.ndarray:
         """The voxel of a hand position; the exact position is kept for :meth:`position_of`."""

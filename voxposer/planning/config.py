@@ -25,6 +25,8 @@ class PlannerConfig:
         target_spacing: inner waypoints that lie closer are thinned out.
         max_curvature: the path is cut before the first sharper bend, 1/voxel.
         pushing_skip_per_k: where an object is moved, every how many waypoints are kept.
+        method: ``"greedy"``, upstream's descent; or ``"straight"``, a straight line to the nearest target whatever is
+            in between, against which the planner's part in a result can be measured.
 
     Raises:
         ValueError: naming the field that is out of range.
@@ -41,8 +43,11 @@ class PlannerConfig:
     target_spacing: float = 1
     max_curvature: float = 3
     pushing_skip_per_k: int = 5
+    method: Literal["greedy", "straight"] = "greedy"
 
     def __post_init__(self) -> None:
+        if self.method not in ("greedy", "straight"):
+            raise ValueError(f"method must be 'greedy' or 'straight', got {self.method!r}")
         if self.stop_criteria != "no_nearby_equal":
             raise ValueError(f"stop_criteria must be 'no_nearby_equal', got {self.stop_criteria!r}")
         for name in ("savgol_window_size", "max_steps", "pushing_skip_per_k"):

@@ -13,7 +13,9 @@ descent in ``planner_numba``, which finds the same voxels several times faster.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeVar, cast
 
@@ -96,6 +98,27 @@ def optimize_paths(
         if engine == "numba" or (engine == "auto" and not traced and _on_cpu(arrays)):
             return _with_numba(*arrays, config)
         return _with_jax(*arrays, config)
+
+
+def descend_value(
+    start: np.ndarray, value: np.ndarray, config: PlannerConfig
+) -> tuple[Int[np.ndarray, "steps 3"], Float[np.ndarray, "waypoints 3"]]:
+    """The planner's descent of a map that is a cost already, such as a cost to go, and its smoothed path.
+
+    Args:
+        start: voxel to start from, [3].
+        value: what each voxel costs, [N, N, N], finite; about 1 at the start and least at the goal.
+        config: the planner's numbers. The path is neither cut before bends nor led to a target.
+
+    Returns:
+        Voxels of the descent, and waypoints.
+    """
+    raw = np.tile(np.asarray(start, np.int32), (config.max_steps + 1, 1))
+    length = planner_numba.walk(value, raw, config)
+    with jax.enable_x64(True):
+        shape = replace(config, max_curvature=math.inf)
+        path, count = _shape(jnp.asarray(raw[None]), jnp.asarray([length], jnp.int32), shape, value.shape[-1])
+    return raw[:length], np.asarray(path[0, : int(count[0])], float)
 
 
 def _checked(

@@ -65,6 +65,21 @@ def descend(
     return raw, length, fault
 
 
+def walk(cost: np.ndarray, raw: np.ndarray, config: PlannerConfig) -> int:
+    """Descend a cost volume.
+
+    Args:
+        cost: [N, N, N], left as it is.
+        raw: int32 [L, 3], the start in its first row; the voxels of the path are written into it.
+        config: the planner's numbers.
+
+    Returns:
+        The number of voxels.
+    """
+    volume = np.array(cost, np.float64, order="C")
+    return _kernels().walk(volume, raw, False, neighbour_offsets(cost.shape[-1]), float(config.stop_threshold))
+
+
 def ends(target: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The target voxels int32 [B, 3] nearest to ``last`` [B, 3], and whether paths have to be led there, bool [B]."""
     size = target.shape[-1]
