@@ -1,4 +1,4 @@
-"""The method as a whole, for a batch: language in, each subtask planned on fresh ground truth and executed.
+"""The method as a whole, for a batch: language in, each subtask planned on a fresh observation and executed.
 
 An environment that speaks ``vecenv.contract`` and an :class:`~voxposer.language.llm.Llm` come in. In each round
 (:meth:`Agent.step`) every slot that has a subtask left plans it on one frozen snapshot: the composer's program asks for
@@ -28,6 +28,7 @@ from voxposer.language.lmp import build_lmps
 from voxposer.paths import plan_paths
 from voxposer.perception.config import HandState, PerceptionConfig
 from voxposer.perception.observation import PerceptionError
+from voxposer.perception.sight import make_sight
 from voxposer.perception.view import Perception
 from voxposer.planning import plan as plans
 from voxposer.planning.config import PlannerConfig
@@ -116,8 +117,9 @@ class Agent:
         self.env, self.config, self._on_planned = env, config, on_planned
         self._llm, self._prompts_dir = llm, prompts_dir
         self._finished, self.succeeded = np.zeros(env.num_envs, bool), np.zeros(env.num_envs, bool)
-        snapshots = env.observe_objects().snapshot
-        self.slots = [self._slot(*pair) for pair in zip(instructions, snapshots, strict=True)]
+        self._sight = make_sight(env, config.perception)
+        homes = self._sight.begin(range(env.num_envs))
+        self.slots = [self._slot(*pair) for pair in zip(instructions, homes, strict=True)]
 
     def begin(self, instructions: Sequence[str], slots: Sequence[int]) -> None:
         """Begin other episodes in some slots, which were just reset; the others continue theirs.
@@ -126,18 +128,18 @@ class Agent:
             instructions: of every slot of the batch, B strings.
             slots: the slots that begin.
         """
-        snapshots = self.env.observe_objects(slots=slots).snapshot
+        homes = self._sight.begin(slots)
         for i in slots:
             _release(self.slots[i])
-            self.slots[i] = self._slot(instructions[i], snapshots[i])
+            self.slots[i] = self._slot(instructions[i], homes[i])
             self._finished[i] = self.succeeded[i] = False
 
     def step(self) -> Control:
         """One round: plan a subtask in every slot that has one left, and execute the plans; stopped slots wait."""
         live = [i for i, slot in enumerate(self.slots) if not self._finished[i] and not slot.cause]
-        snapshots = self.env.observe_objects(slots=live).snapshot
+        seen = self._sight.look(live, [slot.grip.closed for slot in self.slots])
         for i in live:
-            self._run_programs(self.slots[i], snapshots[i])
+            self._run_programs(self.slots[i], seen.snapshot[i], seen.error[i])
         waypoints = self._plan(live)
         if not any(waypoints):
             return self._record(self._wait())
@@ -149,19 +151,18 @@ class Agent:
         for slot in self.slots:
             _release(slot)
 
-    def _slot(self, instruction: str, snapshot: ObjectsSnapshot | None) -> Slot:
-        """A slot whose episode has just begun."""
+    def _slot(self, instruction: str, home: np.ndarray) -> Slot:
+        """A slot whose episode has just begun, with the hand at ``home``, xyz + wxyz, [7]."""
         interface = Interface()
-        home = np.zeros(7) if snapshot is None else snapshot.ee_pose.copy()
         lmps = build_lmps(interface.functions(), self._llm, self._prompts_dir)
-        return Slot(instruction, lmps, interface, home)
+        return Slot(instruction, lmps, interface, home.copy())
 
     # -- one slot's subtask --------------------------------------------------------------------------------------------
 
-    def _run_programs(self, slot: Slot, snapshot: ObjectsSnapshot | None) -> None:
+    def _run_programs(self, slot: Slot, snapshot: ObjectsSnapshot | None, error: str) -> None:
         """Run the programs of the next subtasks until one asks for a motion."""
         if snapshot is None:
-            slot.stop("no ground truth: the slot's physics failed")
+            slot.stop(f"no observation: {error or 'the slot is not running'}")
             return
         try:
             perception = self._look(slot, snapshot)
@@ -174,8 +175,8 @@ class Agent:
                 requests = tuple(slot.interface.taken())
                 if requests:
                     slot.enter(Moving(requests))
-        except (HostFault, PerceptionError, InterfaceError) as error:
-            _stop_with(slot, error)
+        except (HostFault, PerceptionError, InterfaceError) as fault:
+            _stop_with(slot, fault)
 
     def _look(self, slot: Slot, snapshot: ObjectsSnapshot) -> Perception:
         """The slot's view of a snapshot, after checking whether the latest grasp holds."""

@@ -10,8 +10,62 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.world import Margins
+
+# Where observations come from, and how pixels get the names of objects.
+SOURCES = ("ground_truth", "camera")
+SEGMENTATIONS = ("renderer", "geometry")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """How depth images become objects. Metres unless noted.
+
+    Attributes:
+        cameras: names of the cameras; those that an environment does not have are an error.
+        segmentation: ``"renderer"``, the instance masks of the renderer; or ``"geometry"``, clusters over the table,
+            named by size and colour.
+        largest_image: of larger images only every second, third, ... row and column is used, pixels.
+        tolerance: a camera sees through a point this far in front of what it sees.
+        voxel: seen points are averaged over voxels of this size.
+        most_points: of an object; voxels are enlarged until there are no more.
+        most_fixture_points: of a fixture.
+        cluster: points within this distance of each other belong together.
+        least_points: pixels by which an object is seen at all.
+        moved: share of an object's remembered points that cameras see through, from which it has moved.
+        fixed: an object that is longer than this, horizontally, is taken to be a fixture.
+        on_table: a surface this close to the table belongs to it.
+        rests: an object whose lowest seen point is this close to the table stands on it.
+        hollow: a space that is open to above and deeper than this can hold things.
+        sticks_out: what extends this far over the outline of a fixture's top is an open drawer.
+        workspace: lower and upper corner of the workspace, relative to the robot's base horizontally and to the table
+            vertically, [2, 3].
+    """
+
+    cameras: tuple[str, ...] = ("agentview", "wrist")
+    segmentation: str = "renderer"
+    largest_image: int = 320
+    tolerance: float = 0.008
+    voxel: float = 0.004
+    most_points: int = 600
+    most_fixture_points: int = 2500
+    cluster: float = 0.02
+    least_points: int = 12
+    moved: float = 0.15
+    fixed: float = 0.25
+    on_table: float = 0.003
+    rests: float = 0.025
+    hollow: float = 0.06
+    sticks_out: float = 0.06
+    workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-0.1, -0.5, -0.09), (0.9, 0.5, 0.36))
+
+    def __post_init__(self) -> None:
+        if self.segmentation not in SEGMENTATIONS:
+            raise InvalidInput(f"segmentation={self.segmentation!r}: expected one of {', '.join(SEGMENTATIONS)}")
+        if isinstance(self.cameras, str) or not self.cameras:
+            raise InvalidInput(f"cameras={self.cameras!r}: give a sequence of names of cameras")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +73,8 @@ class PerceptionConfig:
     """How objects are seen and grasped. Metres unless noted.
 
     Attributes:
+        source: ``"ground_truth"``, what ``observe_objects`` returns; or ``"camera"``, depth images.
+        camera: how depth images become objects.
         margins: of picking and placing.
         held_box: half extents of the space between the pads, along the hand's x, y (closing) and z. While the fingers
             are closed around something, an object with points in this space is held. The closing half extent is added
@@ -38,6 +94,8 @@ class PerceptionConfig:
         home_reach: distance of the hand before the robot's base when an episode begins.
     """
 
+    source: str = "ground_truth"
+    camera: CameraConfig = field(default_factory=CameraConfig)
     margins: Margins = field(default_factory=lambda: Margins(gripper=Gripper(wrist=0.14), grasp_tilts=(0.3, 0.6)))
     held_box: tuple[float, float, float] = (0.020, 0.006, 0.022)
     closed_gap: float = 0.0015
@@ -53,6 +111,18 @@ class PerceptionConfig:
     above: float = 0.10
     edge: float = 0.03
     home_reach: float = 0.45
+
+    def __post_init__(self) -> None:
+        if self.source not in SOURCES:
+            raise InvalidInput(f"perception={self.source!r}: expected one of {', '.join(SOURCES)}")
+
+    @property
+    def title(self) -> str:
+        """How results name it: "perception: ground truth", or the cameras and what segments their images."""
+        if self.source == "ground_truth":
+            return "perception: ground truth"
+        masks = {"renderer": "renderer masks", "geometry": "segmented by geometry"}[self.camera.segmentation]
+        return f"perception: camera, {' and '.join(self.camera.cameras)}, {masks}"
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from vecenv.contract import BatchEnv, Control, ResetInfo
+from vecenv.errors import InvalidInput
 from voxposer.agent import Agent, AgentConfig
 from voxposer.language.llm import Llm, LlmConfig
+from voxposer.perception.config import CameraConfig, PerceptionConfig
 from voxposer.simpler_scene import hands
 from voxposer.slots import Slot
 
@@ -27,9 +29,13 @@ class VoxPoserPolicy:
         prompts_dir: a folder of prompts to use in place of the package's own.
         passes: how often an instruction is planned again after it was followed to the end without success.
         api_base: address of the model's provider, litellm's own by default.
+        perception: ``"ground_truth"``, the simulator's objects; or ``"camera"``, depth images.
+        segmentation: of camera images: ``"renderer"``, its instance masks; or ``"geometry"``, none.
+        cameras: of ``perception="camera"``, their names, with commas; by default all that ``CameraConfig`` names and
+            the suite has.
 
     Attributes:
-        name: how the policy is called in results, the model included.
+        name: how the policy is called in results, the model and the perception included.
         agent: what drives the present batch.
     """
 
@@ -39,12 +45,25 @@ class VoxPoserPolicy:
         prompts_dir: str | None = None,
         passes: int = 3,
         api_base: str | None = None,
+        perception: str = "ground_truth",
+        segmentation: str = "renderer",
+        cameras: str | None = None,
     ) -> None:
-        self.name = f"voxposer ({model}{', rule-based' if model.startswith('offline/') else ''})"
-        self.config = AgentConfig(passes=passes)
+        names = tuple(name.strip() for name in cameras.split(",")) if cameras else CameraConfig().cameras
+        camera = CameraConfig(cameras=names, segmentation=segmentation)
+        seeing = PerceptionConfig(source=perception, camera=camera)
+        if perception != "camera" and (cameras or segmentation != CameraConfig().segmentation):
+            raise InvalidInput("segmentation and cameras are options of perception=camera")
+        self.config = AgentConfig(passes=passes, perception=seeing)
+        writer = f"{model}{', rule-based' if model.startswith('offline/') else ''}"
+        self.name = f"voxposer ({writer}; {seeing.title})"
         self._llm = Llm(LlmConfig(model=model, api_base=api_base))
         self._prompts_dir = prompts_dir
         self.agent: Agent | None = None
+
+    def needed_cameras(self) -> tuple[str, ...]:
+        """The cameras whose depth images are read; none with ground truth."""
+        return self.config.perception.camera.cameras if self.config.perception.source == "camera" else ()
 
     def reset(self, env: BatchEnv, info: ResetInfo) -> None:
         """Begin with a freshly placed batch, and let go of the one before."""
@@ -80,6 +99,7 @@ def report(agent: Agent, index: int) -> dict[str, Any]:
     calls = slot.lmps.trace
     paid = [call for call in calls if not call.cached]
     return {
+        "perception": agent.config.perception.title,
         "subtasks": slot.progress.begun,
         "passes": slot.progress.passes,
         "waypoints": slot.counts.waypoints,
