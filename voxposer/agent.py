@@ -121,6 +121,11 @@ class Agent:
         homes = self._sight.begin(range(env.num_envs))
         self.slots = [self._slot(*pair) for pair in zip(instructions, homes, strict=True)]
 
+    @property
+    def perception(self) -> str:
+        """Where observations come from, in words: ground truth, or which cameras and what segments their images."""
+        return self._sight.title
+
     def begin(self, instructions: Sequence[str], slots: Sequence[int]) -> None:
         """Begin other episodes in some slots, which were just reset; the others continue theirs.
 

@@ -17,6 +17,8 @@ from vecenv.manipulation.world import Margins
 # Where observations come from, and how pixels get the names of objects.
 SOURCES = ("ground_truth", "camera")
 SEGMENTATIONS = ("renderer", "geometry")
+# The cameras that are used unless others are named.
+CAMERAS = ("agentview", "wrist")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,9 +26,11 @@ class CameraConfig:
     """How depth images become objects. Metres unless noted.
 
     Attributes:
-        cameras: names of the cameras; those that an environment does not have are an error.
+        cameras: names of the cameras; those that an environment does not have are an error. None for those of
+            agentview and wrist that it has.
         segmentation: ``"renderer"``, the instance masks of the renderer; or ``"geometry"``, clusters over the table,
             named by size and colour.
+        colored: an object without a mask is looked for by the colour in its name, as far as it has one.
         largest_image: of larger images only every second, third, ... row and column is used, pixels.
         tolerance: a camera sees through a point this far in front of what it sees.
         voxel: seen points are averaged over voxels of this size.
@@ -34,7 +38,7 @@ class CameraConfig:
         most_fixture_points: of a fixture.
         cluster: points within this distance of each other belong together.
         least_points: pixels by which an object is seen at all.
-        moved: share of an object's remembered points that cameras see through, from which it has moved.
+        moved: share of an object's remembered points in view that are not seen again, from which it has moved.
         fixed: an object that is longer than this, horizontally, is taken to be a fixture.
         on_table: a surface this close to the table belongs to it.
         rests: an object whose lowest seen point is this close to the table stands on it.
@@ -44,8 +48,9 @@ class CameraConfig:
             vertically, [2, 3].
     """
 
-    cameras: tuple[str, ...] = ("agentview", "wrist")
+    cameras: tuple[str, ...] | None = None
     segmentation: str = "renderer"
+    colored: bool = False
     largest_image: int = 320
     tolerance: float = 0.008
     voxel: float = 0.004
@@ -53,7 +58,7 @@ class CameraConfig:
     most_fixture_points: int = 2500
     cluster: float = 0.02
     least_points: int = 12
-    moved: float = 0.15
+    moved: float = 0.25
     fixed: float = 0.25
     on_table: float = 0.003
     rests: float = 0.025
@@ -64,8 +69,8 @@ class CameraConfig:
     def __post_init__(self) -> None:
         if self.segmentation not in SEGMENTATIONS:
             raise InvalidInput(f"segmentation={self.segmentation!r}: expected one of {', '.join(SEGMENTATIONS)}")
-        if isinstance(self.cameras, str) or not self.cameras:
-            raise InvalidInput(f"cameras={self.cameras!r}: give a sequence of names of cameras")
+        if self.cameras is not None and (isinstance(self.cameras, str) or not all(self.cameras) or not self.cameras):
+            raise InvalidInput(f"cameras={self.cameras!r}: give a sequence of names of cameras, or None")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,11 +123,11 @@ class PerceptionConfig:
 
     @property
     def title(self) -> str:
-        """How results name it: "perception: ground truth", or the cameras and what segments their images."""
+        """How results name it: "ground truth", or "camera" and what segments its images."""
         if self.source == "ground_truth":
-            return "perception: ground truth"
+            return "ground truth"
         masks = {"renderer": "renderer masks", "geometry": "segmented by geometry"}[self.camera.segmentation]
-        return f"perception: camera, {' and '.join(self.camera.cameras)}, {masks}"
+        return f"camera, {masks}"
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,10 @@ from scipy.spatial import cKDTree
 from vecenv.observations import PointCloud
 from voxposer.perception.cameras import DepthView
 
+# A surface this close to an object, horizontally, is what it stands on, metres.
+_BESIDE = 0.03
+# Shares of an object's height, from its top, whose middle may be its axis.
+_SHARES = (0.2, 0.1, 0.35, 0.5, 0.75, 1.0)
 NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
@@ -102,35 +106,68 @@ def seen_through(points: np.ndarray, views: Sequence[DepthView], tolerance: floa
     return free
 
 
-def centre_of_top(points: np.ndarray, bottom: float) -> np.ndarray:
-    """Middle of the upper fifth of an object, horizontally, [2].
+def middle_of(points: np.ndarray) -> np.ndarray:
+    """Middle of the box around points [N, 3], horizontally, [2]."""
+    return (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
 
-    From a camera above it, the upper side of an object is seen whole; its sides are not.
+
+def axis_of(points: np.ndarray, bottom: float, views: Sequence[DepthView], tolerance: float) -> np.ndarray:
+    """Where the vertical axis of an object is, about which half a turn changes nothing, [2].
+
+    From a camera above it, the upper side of an object is seen whole and its sides are not. Tried are the middles of
+    upper shares of the object, the top alone to all of it; the best turns most points onto seen ones, and fewest to
+    where cameras see that nothing is.
+
+    Args:
+        points: what is seen of the object, [N, 3].
+        bottom: height of what carries it, metres.
+        views: of the cameras now.
+        tolerance: of distances, metres.
     """
-    top = points[:, 2].max()
-    upper = points[points[:, 2] >= top - max(0.2 * (top - bottom), 0.008), :2]
-    return (upper.min(axis=0) + upper.max(axis=0)) / 2
+    top, tree = float(points[:, 2].max()), cKDTree(points)
+    best, middle = -np.inf, middle_of(points)
+    for share in _SHARES:
+        tried = middle_of(points[points[:, 2] >= top - max(share * (top - bottom), 0.008)])
+        turned = _half_turn(points, tried)
+        met = tree.query(turned)[0] < tolerance
+        score = float(met.mean() - seen_through(turned, views, tolerance).mean())
+        if score > best + 0.01:
+            best, middle = score, tried
+    return middle
 
 
-def support_under(points: np.ndarray, others: np.ndarray, table: float) -> float:
-    """Height of what carries an object: the highest of other points under its middle, else the table.
+def _half_turn(points: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    return np.append(2 * axis, 0.0) + points * [-1.0, -1.0, 1.0]
+
+
+def support_under(points: np.ndarray, others: PointCloud, table: float) -> float:
+    """Height of what carries an object, metres.
+
+    It is the highest of other points under its middle; where none are seen, the height of level surfaces around it;
+    else the table.
 
     Args:
         points: of the object, [N, 3].
-        others: of everything else, [M, 3].
+        others: what is seen of everything else.
         table: its height, metres.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     reach = 0.45 * float((high - low)[:2].min())
-    under = others[np.linalg.norm(others[:, :2] - (low + high)[:2] / 2, axis=1) < reach]
-    under = under[under[:, 2] < low[2] + 0.01]
-    return max(table, float(under[:, 2].max(initial=table)))
+    below = kept(others, others.points[:, 2] < low[2] + 0.01)
+    under = np.linalg.norm(below.points[:, :2] - (low + high)[:2] / 2, axis=1) < reach
+    if under.any():
+        return max(table, float(below.points[under, 2].max()))
+    level = below.points[below.normals[:, 2] > 0.9]
+    if not len(level):
+        return table
+    beside = cKDTree(points[:, :2]).query(level[:, :2])[0] < _BESIDE
+    return max(table, float(np.percentile(level[beside, 2], 75))) if beside.any() else table
 
 
 def completed(cloud: PointCloud, bottom: float, views: Sequence[DepthView], tolerance: float) -> PointCloud:
     """A seen surface with its unseen sides and underside, by two assumptions.
 
-    An object looks the same after half a turn about the vertical through the middle of its top; what that adds is left
+    An object looks the same after half a turn about a vertical axis (:func:`axis_of`); what that adds is left
     out where a camera sees that nothing is there. And it extends straight down to what carries it.
 
     Args:
@@ -139,8 +176,8 @@ def completed(cloud: PointCloud, bottom: float, views: Sequence[DepthView], tole
         views: of the cameras now.
         tolerance: a camera sees through a point this far in front of what it sees, metres.
     """
-    middle = np.append(2 * centre_of_top(cloud.points, bottom), 0.0)
-    turned = PointCloud(middle + cloud.points * [-1.0, -1.0, 1.0], cloud.normals * [-1.0, -1.0, 1.0])
+    axis = axis_of(cloud.points, bottom, views, tolerance)
+    turned = PointCloud(_half_turn(cloud.points, axis), cloud.normals * [-1.0, -1.0, 1.0])
     turned = kept(turned, ~seen_through(turned.points, views, tolerance))
     whole = joined([cloud, turned])
     return joined([whole, _down_to(whole, bottom)])

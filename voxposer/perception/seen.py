@@ -2,8 +2,8 @@
 
 Depth views with a name for each pixel and the pose of the hand come in, once a round; an
 :class:`~vecenv.observations.ObjectsSnapshot` made of seen points alone goes out, which grasping, placing and planning
-read as they read ground truth. Its names are those that were seen; poses are the middle of an object's top over its
-lowest point, unrotated; there are no regions, no goal, and no parts but those of ``seen_parts``.
+read as they read ground truth. Its names are those that were seen; poses are the middle of the box around an object
+over its lowest point, unrotated; there are no regions, no goal, and no parts but those of ``seen_parts``.
 
 What is hidden now is where it was seen last. An object through whose remembered points a camera sees has moved: its
 memory is dropped. What the hand has grasped moves with it, as it was seen before.
@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import binary_dilation
+from scipy.spatial import cKDTree
 
 from vecenv.errors import NotFound
 from vecenv.manipulation.world import matrix
@@ -96,11 +97,12 @@ class SceneMemory:
             self.table = table_height(self._inside(clouds.joined([background, *self._everything(labelled)])))
         self._update_held(labelled, robot)
         self._update_seen(labelled)
-        self._complete([view.view for view in labelled])
+        scenery = self._scenery(background)
+        self._complete([view.view for view in labelled], scenery)
         if self.held is not None:
             name, model = self.held
             self.whole[name] = _moved(model, matrix(robot.ee_pose[3:]), robot.ee_pose[:3])
-        return self._snapshot(self._scenery(background), robot)
+        return self._snapshot(scenery, robot)
 
     # -- memory --------------------------------------------------------------------------------------------------------
 
@@ -153,15 +155,10 @@ class SceneMemory:
 
     def _update_seen(self, labelled: Sequence[LabelledView]) -> None:
         """Add what is seen now, and drop what has moved; the held object is not looked at."""
-        camera, views = self.config.camera, [view.view for view in labelled]
+        camera = self.config.camera
         now = {name: self._cleaned(name, labelled) for name in dict.fromkeys(n for v in labelled for n in v.names if n)}
         for name in list(self.seen):
-            gone = clouds.seen_through(self.seen[name].points, views, camera.tolerance)
-            gone |= self._replaced(name, labelled)
-            if gone.mean() > camera.moved:
-                self._forget(name)
-            else:
-                self.seen[name] = clouds.kept(self.seen[name], ~gone)
+            self._recheck(name, now.get(name, clouds.NO_POINTS), labelled)
         for name, cloud in now.items():
             if self.held is not None and name == self.held[0]:
                 continue
@@ -171,13 +168,21 @@ class SceneMemory:
                 most = camera.most_fixture_points if self._is_fixed(both) else camera.most_points
                 self.seen[name] = clouds.thinned(both, camera.voxel, most)
 
-    def _replaced(self, name: str, labelled: Sequence[LabelledView]) -> np.ndarray:
-        """Which remembered points of an object are where a camera sees another surface that is not the robot's."""
-        points = self.seen[name].points
-        gone = np.zeros(len(points), bool)
+    def _recheck(self, name: str, now: PointCloud, labelled: Sequence[LabelledView]) -> None:
+        """Drop the remembered points of an object that cameras see to be gone; all of them if it has moved."""
+        camera, points = self.config.camera, self.seen[name].points
+        gone = clouds.seen_through(points, [view.view for view in labelled], camera.tolerance)
+        shown = np.zeros(len(points), bool)
         for view in labelled:
-            gone |= view.view.shows(points, self.config.camera.tolerance) & ~self._is_shown(points, name, view)
-        return gone
+            visible = view.view.shows(points, camera.tolerance)
+            shown |= visible
+            gone |= visible & ~self._is_shown(points, name, view)
+        away = cKDTree(now.points).query(points)[0] if len(now.points) else np.full(len(points), np.inf)
+        gone |= shown & (away > 1.5 * camera.tolerance)
+        if gone.sum() > camera.moved * max(int((gone | shown).sum()), 1):
+            self._forget(name)
+        else:
+            self.seen[name] = clouds.kept(self.seen[name], ~gone)
 
     def _is_shown(self, points: np.ndarray, name: str, view: LabelledView) -> np.ndarray:
         """Whether a camera shows an object, or the robot, within two pixels of each point."""
@@ -195,7 +200,7 @@ class SceneMemory:
         cloud = clouds.thinned(clouds.kept(cloud, ~on_table), camera.voxel)
         return clouds.without_outliers(cloud, camera.cluster, 0.1)
 
-    def _complete(self, views: Sequence[DepthView]) -> None:
+    def _complete(self, views: Sequence[DepthView], scenery: PointCloud) -> None:
         """Complete what is not fixed; what is fixed stays as it is seen."""
         camera = self.config.camera
         assert self.table is not None
@@ -203,8 +208,8 @@ class SceneMemory:
             if self._is_fixed(cloud):
                 self.whole[name] = cloud
                 continue
-            others = [other.points for known, other in self.seen.items() if known != name]
-            bottom = clouds.support_under(cloud.points, np.concatenate([np.zeros((0, 3)), *others]), self.table)
+            others = [other for known, other in self.seen.items() if known != name]
+            bottom = clouds.support_under(cloud.points, clouds.joined([*others, scenery]), self.table)
             whole = clouds.completed(cloud, bottom, views, camera.tolerance)
             self.whole[name] = clouds.thinned(whole, camera.voxel, camera.most_points)
 
@@ -241,6 +246,11 @@ class SceneMemory:
         rest = clouds.thinned(clouds.kept(cloud, ~flat), _SCENERY_VOXEL)
         return clouds.joined([level, clouds.without_outliers(rest, 2 * _SCENERY_VOXEL, 0.05)])
 
+    def _grounded(self, scenery: PointCloud) -> PointCloud:
+        """Scenery of which the table alone has normals, so that nothing else is taken for the ground."""
+        off = np.abs(scenery.points[:, 2:] - (self.table or 0.0)) > 1e-9
+        return PointCloud(scenery.points, np.where(off, 0.0, scenery.normals))
+
     def _snapshot(self, scenery: PointCloud, robot: Proprioception) -> ObjectsSnapshot:
         movable = tuple(name for name, cloud in self.whole.items() if not self._is_fixed(cloud))
         names = (*movable, *(name for name in self.whole if name not in movable))
@@ -256,7 +266,7 @@ class SceneMemory:
             poses={name: _pose(cloud) for name, cloud in copied.items()},
             regions={},
             goal=(),
-            scene=clouds.joined([*copied.values(), scenery]),
+            scene=clouds.joined([*copied.values(), self._grounded(scenery)]),
             ee_pose=robot.ee_pose.copy(),
             gripper=robot.gripper.copy(),
             workspace=self._bounds(),
@@ -284,8 +294,7 @@ def table_height(cloud: PointCloud) -> float:
 
 
 def _pose(cloud: PointCloud) -> np.ndarray:
-    bottom = float(cloud.points[:, 2].min())
-    return np.array([*clouds.centre_of_top(cloud.points, bottom), bottom, 1.0, 0.0, 0.0, 0.0])
+    return np.array([*clouds.middle_of(cloud.points), float(cloud.points[:, 2].min()), 1.0, 0.0, 0.0, 0.0])
 
 
 def _moved(cloud: PointCloud, rotation: np.ndarray, pos: np.ndarray) -> PointCloud:

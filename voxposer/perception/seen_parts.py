@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from vecenv.observations import Part, PointCloud, RegionBox
 from voxposer.perception.config import PerceptionConfig
-from voxposer.perception.points import centre_of_top, clusters, kept
+from voxposer.perception.points import clusters, kept, middle_of
 
 # A rim, a top and a floor are level within this, metres.
 _LEVEL = 0.012
@@ -58,7 +58,7 @@ def _inside(name: str, cloud: PointCloud, least_depth: float) -> Part | None:
     """
     points, normals = cloud.points, cloud.normals
     bottom, rim = float(points[:, 2].min()), float(points[:, 2].max())
-    middle = centre_of_top(points, bottom)
+    middle = middle_of(points)
     out = points[:, :2] - middle
     facing = -(normals[:, :2] * out).sum(axis=1) / np.maximum(np.linalg.norm(out, axis=1), 1e-6)
     wall = (facing > 0.6) & (np.abs(normals[:, 2]) < 0.6) & (points[:, 2] < rim - 0.005)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from vecenv.contract import BatchEnv
 from vecenv.observations import Egocentric, ImagesUnavailable, Objects, ObjectsSnapshot
 from voxposer.perception.cameras import depth_views
-from voxposer.perception.config import PerceptionConfig
+from voxposer.perception.config import CAMERAS, PerceptionConfig
 from voxposer.perception.seen import NotSeen, Proprioception, SceneMemory
 from voxposer.perception.segments import Segmenter, make_segmenter
 
@@ -31,6 +31,11 @@ class HandReporting(Protocol):
 
 class Sight(Protocol):
     """The source of observations."""
+
+    @property
+    def title(self) -> str:
+        """What it is, in words, for results."""
+        ...
 
     def look(self, slots: Sequence[int], closed: Sequence[bool]) -> Objects:
         """Snapshots of some slots; None, with a reason, where there is none.
@@ -60,6 +65,11 @@ class GroundTruth:
     def __init__(self, env: BatchEnv) -> None:
         self._env = env
 
+    @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return PerceptionConfig().title
+
     def look(self, slots: Sequence[int], closed: Sequence[bool]) -> Objects:
         """The simulator's snapshots."""
         del closed
@@ -84,8 +94,14 @@ class CameraSight:
 
     def __init__(self, env: BatchEnv, config: PerceptionConfig) -> None:
         self._env, self._config = env, config
+        self._cameras = config.camera.cameras
         self._memory: dict[int, SceneMemory] = {}
         self._segmenter: Segmenter = make_segmenter(config.camera)
+
+    @property
+    def title(self) -> str:
+        """What it is, in words, with the cameras once they are known."""
+        return ", ".join([self._config.title, *([" and ".join(self._cameras)] if self._cameras else [])])
 
     def begin(self, slots: Sequence[int]) -> np.ndarray:
         """Forget these slots; the poses of the hands are from proprioception."""
@@ -107,15 +123,16 @@ class CameraSight:
         if not slots:
             return Objects(tuple(snapshots), tuple(errors))
         seen = self._env.observe_egocentric(slots=list(slots))
-        missing = [name for name in camera.cameras if name not in seen.depths]
+        if self._cameras is None:
+            self._cameras = tuple(name for name in CAMERAS if name in seen.depths) or CAMERAS[:1]
+        missing = [name for name in self._cameras if name not in seen.depths]
         if missing:
             raise ImagesUnavailable(
                 f"perception from cameras needs {', '.join(missing)}; the environment has {', '.join(seen.depths) or 'none'}"
             )
         masks = camera.segmentation == "renderer"
-        views = depth_views(
-            seen, camera.cameras, slots, masks=masks, colors=not masks, largest=camera.largest_image
-        )
+        colors = camera.colored or not masks
+        views = depth_views(seen, self._cameras, slots, masks=masks, colors=colors, largest=camera.largest_image)
         poses, grippers = _proprioception(self._env, seen)
         for i, own in zip(slots, views, strict=True):
             robot = Proprioception(poses[i], grippers[i], closed[i])

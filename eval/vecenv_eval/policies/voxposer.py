@@ -16,7 +16,7 @@ from vecenv.contract import BatchEnv, Control, ResetInfo
 from vecenv.errors import InvalidInput
 from voxposer.agent import Agent, AgentConfig
 from voxposer.language.llm import Llm, LlmConfig
-from voxposer.perception.config import CameraConfig, PerceptionConfig
+from voxposer.perception.config import CAMERAS, CameraConfig, PerceptionConfig
 from voxposer.simpler_scene import hands
 from voxposer.slots import Slot
 
@@ -31,8 +31,8 @@ class VoxPoserPolicy:
         api_base: address of the model's provider, litellm's own by default.
         perception: ``"ground_truth"``, the simulator's objects; or ``"camera"``, depth images.
         segmentation: of camera images: ``"renderer"``, its instance masks; or ``"geometry"``, none.
-        cameras: of ``perception="camera"``, their names, with commas; by default all that ``CameraConfig`` names and
-            the suite has.
+        cameras: of ``perception="camera"``, their names, with commas; by default agentview, and wrist where there is
+            one.
 
     Attributes:
         name: how the policy is called in results, the model and the perception included.
@@ -49,21 +49,22 @@ class VoxPoserPolicy:
         segmentation: str = "renderer",
         cameras: str | None = None,
     ) -> None:
-        names = tuple(name.strip() for name in cameras.split(",")) if cameras else CameraConfig().cameras
+        names = None if cameras is None else tuple(name.strip() for name in cameras.split(","))
         camera = CameraConfig(cameras=names, segmentation=segmentation)
         seeing = PerceptionConfig(source=perception, camera=camera)
-        if perception != "camera" and (cameras or segmentation != CameraConfig().segmentation):
+        if perception != "camera" and (cameras is not None or segmentation != CameraConfig().segmentation):
             raise InvalidInput("segmentation and cameras are options of perception=camera")
         self.config = AgentConfig(passes=passes, perception=seeing)
         writer = f"{model}{', rule-based' if model.startswith('offline/') else ''}"
-        self.name = f"voxposer ({writer}; {seeing.title})"
+        self.name = f"voxposer ({writer}; perception: {seeing.title})"
         self._llm = Llm(LlmConfig(model=model, api_base=api_base))
         self._prompts_dir = prompts_dir
         self.agent: Agent | None = None
 
     def needed_cameras(self) -> tuple[str, ...]:
         """The cameras whose depth images are read; none with ground truth."""
-        return self.config.perception.camera.cameras if self.config.perception.source == "camera" else ()
+        seeing = self.config.perception
+        return (seeing.camera.cameras or CAMERAS[:1]) if seeing.source == "camera" else ()
 
     def reset(self, env: BatchEnv, info: ResetInfo) -> None:
         """Begin with a freshly placed batch, and let go of the one before."""
@@ -99,7 +100,7 @@ def report(agent: Agent, index: int) -> dict[str, Any]:
     calls = slot.lmps.trace
     paid = [call for call in calls if not call.cached]
     return {
-        "perception": agent.config.perception.title,
+        "perception": agent.perception,
         "subtasks": slot.progress.begun,
         "passes": slot.progress.passes,
         "waypoints": slot.counts.waypoints,
