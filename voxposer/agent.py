@@ -144,7 +144,7 @@ class Agent:
         live = [i for i, slot in enumerate(self.slots) if not self._finished[i] and not slot.cause]
         seen = self._sight.look(live, [slot.grip.closed for slot in self.slots])
         for i in live:
-            self._run_programs(self.slots[i], seen.snapshot[i], seen.error[i])
+            self._run_programs(self.slots[i], seen.snapshot[i], seen.error[i] or self._sight.unseen(i))
         waypoints = self._plan(live)
         if not any(waypoints):
             return self._record(self._wait())
@@ -164,10 +164,10 @@ class Agent:
 
     # -- one slot's subtask --------------------------------------------------------------------------------------------
 
-    def _run_programs(self, slot: Slot, snapshot: ObjectsSnapshot | None, error: str) -> None:
-        """Run the programs of the next subtasks until one asks for a motion."""
+    def _run_programs(self, slot: Slot, snapshot: ObjectsSnapshot | None, missing: str) -> None:
+        """Run the programs of the next subtasks until one asks for a motion; ``missing`` says what is not seen."""
         if snapshot is None:
-            slot.stop(f"no observation: {error or 'the slot is not running'}")
+            slot.stop(f"no observation: {missing or 'the slot is not running'}")
             return
         try:
             perception = self._look(slot, snapshot)
@@ -180,8 +180,8 @@ class Agent:
                 requests = tuple(slot.interface.taken())
                 if requests:
                     slot.enter(Moving(requests))
-        except (HostFault, PerceptionError, InterfaceError) as fault:
-            _stop_with(slot, fault)
+        except (HostFault, PerceptionError, InterfaceError) as error:
+            _stop_with(slot, error, missing)
 
     def _look(self, slot: Slot, snapshot: ObjectsSnapshot) -> Perception:
         """The slot's view of a snapshot, after checking whether the latest grasp holds."""
@@ -334,8 +334,9 @@ def _release(slot: Slot) -> None:
     slot.interface.end()
 
 
-def _stop_with(slot: Slot, error: Exception) -> None:
-    slot.stop(f"{type(error).__name__}: {error}")
+def _stop_with(slot: Slot, error: Exception, missing: str = "") -> None:
+    cause = f"{type(error).__name__}: {error}"
+    slot.stop(f"{missing} ({cause})" if missing else cause)
 
 
 def _remember_grasp(slot: Slot, request: MotionRequest, end: np.ndarray) -> None:

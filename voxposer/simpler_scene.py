@@ -94,7 +94,10 @@ def widowx_config(passes: int = 3, seeing: PerceptionConfig = PerceptionConfig()
     perception = PerceptionConfig(
         source=seeing.source,
         camera=camera,
-        margins=margins, held_box=(0.018, 0.008, 0.020), closed_gap=0.0095, home_reach=_HOME_REACH
+        margins=margins,
+        held_box=(0.018, 0.008, 0.020),
+        closed_gap=0.0095,
+        home_reach=_HOME_REACH,
     )
     # Waypoints are left within 1 cm and 0.1 rad, and a hand tilted so far loses a spoon: 3 more ticks at each stop.
     plan = PlanConfig(hold_ticks=3, settle=3, full_speed=0.03)

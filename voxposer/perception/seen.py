@@ -26,6 +26,8 @@ from voxposer.perception.cameras import DepthView
 from voxposer.perception.config import PerceptionConfig
 from voxposer.perception.seen_parts import parts_of
 
+# The instance that renderers call the robot.
+ROBOT = "robot"
 # Scenery is sampled so: the table, and what stands out of it. Metres.
 _TABLE_VOXEL, _SCENERY_VOXEL = 0.02, 0.01
 # Share of the points of a grasped object through which cameras must see before it is not believed to be held.
@@ -94,7 +96,7 @@ class SceneMemory:
         """
         background = clouds.joined([view.of("") for view in labelled])
         if self.table is None:
-            self.table = table_height(self._inside(clouds.joined([background, *self._everything(labelled)])))
+            self.table = table_height(self.inside(clouds.joined([background, *self._everything(labelled)])))
         self._update_held(labelled, robot)
         self._update_seen(labelled)
         scenery = self._scenery(background)
@@ -195,7 +197,7 @@ class SceneMemory:
         """What all cameras show of an object now, without outliers and without the table at its edges."""
         camera = self.config.camera
         assert self.table is not None
-        cloud = self._inside(clouds.joined([view.of(name) for view in labelled]))
+        cloud = self.inside(clouds.joined([view.of(name) for view in labelled]))
         on_table = (cloud.points[:, 2] < self.table + camera.on_table) & (cloud.normals[:, 2] > 0.9)
         cloud = clouds.thinned(clouds.kept(cloud, ~on_table), camera.voxel)
         return clouds.without_outliers(cloud, camera.cluster, 0.1)
@@ -218,16 +220,16 @@ class SceneMemory:
 
     # -- the snapshot --------------------------------------------------------------------------------------------------
 
-    def _bounds(self) -> np.ndarray:
+    def bounds(self) -> np.ndarray:
         """Corners of the workspace, [2, 3]; heights are relative until the table is known."""
         corners = np.array(self.config.camera.workspace, float)
         corners[:, :2] += self.base
         corners[:, 2] += self.table or 0.0
         return corners
 
-    def _inside(self, cloud: PointCloud) -> PointCloud:
+    def inside(self, cloud: PointCloud) -> PointCloud:
         """The points over the workspace, at any height before the table is known."""
-        low, high = self._bounds()
+        low, high = self.bounds()
         used = 2 if self.table is None else 3
         low, high = low - [0.05, 0.05, 0.0], high + [0.05, 0.05, 0.15]
         rows = ((cloud.points > low) & (cloud.points < high))[:, :used].all(axis=1)
@@ -236,7 +238,7 @@ class SceneMemory:
     def _scenery(self, background: PointCloud) -> PointCloud:
         """What belongs to no object: the table, flat and at one height, and what stands out of it."""
         assert self.table is not None
-        cloud = self._inside(background)
+        cloud = self.inside(background)
         flat = (np.abs(cloud.points[:, 2] - self.table) < 0.01) & (cloud.normals[:, 2] > 0.9)
         table = clouds.thinned(clouds.kept(cloud, flat), _TABLE_VOXEL)
         level = PointCloud(
@@ -269,7 +271,7 @@ class SceneMemory:
             scene=clouds.joined([*copied.values(), self._grounded(scenery)]),
             ee_pose=robot.ee_pose.copy(),
             gripper=robot.gripper.copy(),
-            workspace=self._bounds(),
+            workspace=self.bounds(),
             movable=movable,
             parts=parts,
         )

@@ -109,7 +109,9 @@ def _top(name: str, cloud: PointCloud) -> Part | None:
     turn = np.eye(3)
     turn[:2, :2] = axes
     height = float(np.median(cloud.points[level, 2]))
-    return Part(name, "top", kept(cloud, level), RegionBox(np.append(centre, height), turn, np.append(half, 0.001), name))
+    return Part(
+        name, "top", kept(cloud, level), RegionBox(np.append(centre, height), turn, np.append(half, 0.001), name)
+    )
 
 
 def _is_broad(xy: np.ndarray) -> np.ndarray:

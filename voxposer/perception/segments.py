@@ -5,34 +5,17 @@ The views of one slot and the names of what may be there come in; the same views
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
-from PIL import Image
 
 from voxposer.perception.cameras import DepthView
+from voxposer.perception.colors import HUES, has_color
 from voxposer.perception.config import CameraConfig
-from voxposer.perception.seen import LabelledView, Proprioception, SceneMemory
-
-# Words for colours and their hues, of a turn; where the first is larger the range goes through 0.
-HUES: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {
-        "red": (0.95, 0.04),
-        "orange": (0.04, 0.11),
-        "yellow": (0.11, 0.20),
-        "green": (0.20, 0.45),
-        "blue": (0.50, 0.70),
-        "purple": (0.70, 0.82),
-        "pink": (0.82, 0.95),
-    }
-)
-# Less saturated or darker than this a pixel has no colour.
-_LEAST_SATURATION, _LEAST_VALUE = 0.4, 0.3
-# The instance that renderers call the robot.
-ROBOT = "robot"
+from voxposer.perception.geometry import GeometrySegments
+from voxposer.perception.seen import ROBOT, LabelledView, Proprioception, SceneMemory
 
 
 def with_color(labelled: LabelledView, name: str) -> LabelledView:
@@ -40,18 +23,10 @@ def with_color(labelled: LabelledView, name: str) -> LabelledView:
     words = [word for word in name.lower().split("_") if word in HUES]
     if not words or labelled.view.colors is None:
         return labelled
-    hue, saturation, value = hsv(labelled.view.colors)
-    low, high = HUES[words[0]]
-    same = ((hue - low) % 1.0 < (high - low) % 1.0) & (saturation > _LEAST_SATURATION) & (value > _LEAST_VALUE)
+    same = has_color(labelled.view.colors, words[0])
     unnamed = np.array([known == "" for known in labelled.names])[labelled.labels]
     labels = np.where(same & unnamed, labelled.names.index(name), labelled.labels)
     return replace(labelled, labels=labels)
-
-
-def hsv(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Hue, saturation and value, 0 to 1, [H, W] each, of colours uint8 [H, W, 3]."""
-    hue, saturation, value = (np.asarray(band, float) / 255 for band in Image.fromarray(colors).convert("HSV").split())
-    return hue, saturation, value
 
 
 class Segmenter(Protocol):
@@ -97,4 +72,6 @@ class RendererMasks:
 
 def make_segmenter(config: CameraConfig) -> Segmenter:
     """What names pixels by a config."""
+    if config.segmentation == "geometry":
+        return GeometrySegments()
     return RendererMasks(colored=config.colored)

@@ -17,8 +17,9 @@ from vecenv.contract import BatchEnv
 from vecenv.observations import Egocentric, ImagesUnavailable, Objects, ObjectsSnapshot
 from voxposer.perception.cameras import depth_views
 from voxposer.perception.config import CAMERAS, PerceptionConfig
-from voxposer.perception.seen import NotSeen, Proprioception, SceneMemory
+from voxposer.perception.seen import ROBOT, NotSeen, Proprioception, SceneMemory
 from voxposer.perception.segments import Segmenter, make_segmenter
+
 
 @runtime_checkable
 class HandReporting(Protocol):
@@ -35,6 +36,10 @@ class Sight(Protocol):
     @property
     def title(self) -> str:
         """What it is, in words, for results."""
+        ...
+
+    def unseen(self, slot: int) -> str:
+        """Which objects of a slot the latest look did not find, in a sentence; "" for none."""
         ...
 
     def look(self, slots: Sequence[int], closed: Sequence[bool]) -> Objects:
@@ -70,6 +75,11 @@ class GroundTruth:
         """What it is, in words."""
         return PerceptionConfig().title
 
+    def unseen(self, slot: int) -> str:
+        """Nothing: the simulator knows all."""
+        del slot
+        return ""
+
     def look(self, slots: Sequence[int], closed: Sequence[bool]) -> Objects:
         """The simulator's snapshots."""
         del closed
@@ -96,6 +106,7 @@ class CameraSight:
         self._env, self._config = env, config
         self._cameras = config.camera.cameras
         self._memory: dict[int, SceneMemory] = {}
+        self._unseen: dict[int, tuple[str, ...]] = {}
         self._segmenter: Segmenter = make_segmenter(config.camera)
 
     @property
@@ -107,9 +118,16 @@ class CameraSight:
         """Forget these slots; the poses of the hands are from proprioception."""
         poses, _ = _proprioception(self._env, self._env.observe_egocentric(slots=[]))
         for i in slots:
+            self._unseen.pop(i, None)
             base = poses[i, :2] - [self._config.home_reach, 0.0]
             self._memory[i] = SceneMemory(self._config, base)
         return poses
+
+    def unseen(self, slot: int) -> str:
+        """Which objects the cameras did not show, and could not be remembered, in a sentence."""
+        names = self._unseen.get(slot, ())
+        how = "by geometry" if self._config.camera.segmentation == "geometry" else "by the cameras"
+        return f"not found {how}: {', '.join(names)}" if names else ""
 
     def look(self, slots: Sequence[int], closed: Sequence[bool]) -> Objects:
         """Snapshots of what is seen and remembered.
@@ -139,7 +157,8 @@ class CameraSight:
             try:
                 memory = self._memory[i]
                 labelled = self._segmenter.label(own, seen.instances[i], memory, robot)
-                snapshots[i] = memory.look(labelled, robot)
+                snapshots[i] = found = memory.look(labelled, robot)
+                self._unseen[i] = tuple(name for name in seen.instances[i] if name not in ("", ROBOT, *found.names))
             except NotSeen as error:
                 errors[i] = str(error)
         return Objects(tuple(snapshots), tuple(errors))
