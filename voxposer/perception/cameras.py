@@ -46,7 +46,8 @@ class DepthView:
     @cached_property
     def valid(self) -> np.ndarray:
         """Pixels that show something, bool [H, W]."""
-        return np.isfinite(self.depth) & (self.depth > 1e-4) & (self.depth < _FARTHEST)
+        shown = np.isfinite(self.depth) & (self.depth > 1e-4) & (self.depth < _FARTHEST)
+        return shown & np.isfinite(self.points).all(axis=2)
 
     @cached_property
     def normals(self) -> np.ndarray:

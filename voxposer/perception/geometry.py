@@ -32,14 +32,14 @@ from voxposer.perception.seen import ROBOT, LabelledView, Proprioception, SceneM
 
 # Lowest height over the table at which something is told from it, metres.
 _OVER_TABLE = 0.008
-# Voxels of clusters, metres: things this far apart are two.
-_APART = 0.006
+# Edge of the voxels that make up clusters, in pixels at the distance of things: what is further apart is two things.
+_PIXELS_APART = 2.0
 # A point this close to a remembered one shows the same object, metres.
 _SAME = 0.010
 # What is this close to the hand, or horizontally to the robot's base, belongs to the robot, metres.
 _HAND, _BASE = 0.07, 0.22
 # Least number of voxels of a thing.
-_LEAST = 10
+_LEAST = 8
 # A cluster with this share of its points where an object was seen is that object.
 _OVERLAP = 0.3
 # Costs above this do not fit: the sum of logarithms of three sizes' ratios, and a distance of colours of 0 to 1.
@@ -116,7 +116,9 @@ class GeometrySegments:
         owner = np.concatenate([np.full(int(rows.sum()), i) for i, rows in enumerate(above)])
         colors = np.concatenate([_colors(view)[rows] for view, rows in zip(views, above, strict=True)])
         wanted = [name for name in names if name not in ("", ROBOT)]
-        labels = self._named(points, colors, table, wanted, memory, robot)
+        pairs = [(view, rows) for view, rows in zip(views, above, strict=True) if rows.any()]
+        size = max((_PIXELS_APART * _pixel_size(view, rows) for view, rows in pairs), default=0.0)
+        labels = self._named(points, colors, table, wanted, size, memory, robot)
         known = ("", None, *wanted)
         found = []
         for i, (view, rows) in enumerate(zip(views, above, strict=True)):
@@ -138,20 +140,21 @@ class GeometrySegments:
         colors: np.ndarray,
         table: float,
         names: Sequence[str],
+        size: float,
         memory: SceneMemory,
         robot: Proprioception,
     ) -> np.ndarray:
-        """Index into ("", None, *names) of each point, int [N]."""
+        """Index into ("", None, *names) of each point, int [N]; clusters are made of voxels of a size, metres."""
         labels = np.zeros(len(points), int)
         if not len(points):
             return labels
-        cluster = _clusters(points)
+        cluster = _clusters(points, size)
         own = np.unique(cluster[_near_robot(points, memory.base, robot)])
         labels[np.isin(cluster, own)] = 1
         free = []
         for number in np.unique(cluster[~np.isin(cluster, own)]):
             rows = np.flatnonzero(cluster == number)
-            if len(np.unique(np.floor(points[rows] / _APART), axis=0)) < _LEAST:
+            if len(np.unique(np.floor(points[rows] / size), axis=0)) < _LEAST:
                 continue
             known = _remembered(points[rows], names, memory)
             labels[rows] = known
@@ -189,9 +192,14 @@ def _remembered(points: np.ndarray, names: Sequence[str], memory: SceneMemory) -
     return 2 + np.argmin(distances, axis=0)
 
 
-def _clusters(points: np.ndarray) -> np.ndarray:
+def _pixel_size(view: DepthView, rows: np.ndarray) -> float:
+    """What a pixel covers at the distance of what some pixels show, metres."""
+    return float(np.median(view.depth[rows]) / abs(view.intrinsics[0, 0]))
+
+
+def _clusters(points: np.ndarray, size: float) -> np.ndarray:
     """Number of the cluster of each of many points: those of voxels that touch belong together."""
-    cells = np.floor((points - points.min(axis=0)) / _APART).astype(int)
+    cells = np.floor((points - points.min(axis=0)) / size).astype(int)
     taken = np.zeros(cells.max(axis=0) + 1, bool)
     taken[tuple(cells.T)] = True
     return label(taken, np.ones((3, 3, 3)))[0][tuple(cells.T)]

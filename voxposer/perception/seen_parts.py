@@ -2,7 +2,7 @@
 
 The seen and completed surface of one object comes in; :class:`~vecenv.observations.Part` s without joints go out, named
 as ground truth names them: ``<object>_inside``, ``<object>_top``, ``<object>_<level>_drawer``. A drawer is found only
-when it is open, by what it sticks out of the fixture; its level is its height on the fixture, in thirds. Handles, doors,
+when it is open, by what sticks out of the fixture; its level is its height on the fixture, in thirds. Handles, doors,
 knobs and closed drawers are not found.
 """
 
@@ -52,7 +52,7 @@ def parts_of(name: str, cloud: PointCloud, *, fixed: bool, table: float, config:
 
 
 def _inside(name: str, cloud: PointCloud, least_depth: float) -> Part | None:
-    """The space inside a container: within the walls that face its axis, from its floor to its rim; None if it has none.
+    """The space inside a container: within the walls that face its axis, from floor to rim; None if it has none.
 
     Where no floor is seen it lies 1 cm over the container's underside.
     """
@@ -143,7 +143,7 @@ def _open_drawer(name: str, cloud: PointCloud, top: Part, table: float, least: f
 
 
 def _outline(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The smallest rectangle around points [N, 2]: centre [2], axes in columns [2, 2], half extents [2]; None for a line."""
+    """The smallest rectangle around points [N, 2], None for a line: centre, axes in columns [2, 2], half extents."""
     try:
         corners = xy[ConvexHull(xy).vertices]
     except (QhullError, ValueError):

@@ -109,6 +109,10 @@ class CameraSight:
         self._unseen: dict[int, tuple[str, ...]] = {}
         self._segmenter: Segmenter = make_segmenter(config.camera)
 
+    def hands(self) -> tuple[np.ndarray, np.ndarray]:
+        """Poses of the hands, xyz + wxyz, [B, 7], and their finger positions, metres, [B, 2], by proprioception."""
+        return _proprioception(self._env, self._env.observe_egocentric(slots=[]))
+
     @property
     def title(self) -> str:
         """What it is, in words, with the cameras once they are known."""
@@ -116,7 +120,7 @@ class CameraSight:
 
     def begin(self, slots: Sequence[int]) -> np.ndarray:
         """Forget these slots; the poses of the hands are from proprioception."""
-        poses, _ = _proprioception(self._env, self._env.observe_egocentric(slots=[]))
+        poses, _ = self.hands()
         for i in slots:
             self._unseen.pop(i, None)
             base = poses[i, :2] - [self._config.home_reach, 0.0]
@@ -145,9 +149,8 @@ class CameraSight:
             self._cameras = tuple(name for name in CAMERAS if name in seen.depths) or CAMERAS[:1]
         missing = [name for name in self._cameras if name not in seen.depths]
         if missing:
-            raise ImagesUnavailable(
-                f"perception from cameras needs {', '.join(missing)}; the environment has {', '.join(seen.depths) or 'none'}"
-            )
+            there = ", ".join(seen.depths) or "none"
+            raise ImagesUnavailable(f"perception from cameras needs {', '.join(missing)}; there are: {there}")
         masks = camera.segmentation == "renderer"
         colors = camera.colored or not masks
         views = depth_views(seen, self._cameras, slots, masks=masks, colors=colors, largest=camera.largest_image)
