@@ -22,7 +22,7 @@ from importlib import resources
 import numpy as np
 from scipy.ndimage import label
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vecenv.observations import PointCloud
 from voxposer.perception import points as clouds
@@ -183,7 +183,7 @@ def _assigned(
 def _remembered(points: np.ndarray, names: Sequence[str], memory: SceneMemory) -> np.ndarray:
     """Index of the remembered object at each point of a cluster, counted from 2; all 0 where too few are at any."""
     distances = [
-        cKDTree(memory.seen[name].points).query(points)[0] if name in memory.seen else np.full(len(points), np.inf)
+        KDTree(memory.seen[name].points).query(points)[0] if name in memory.seen else np.full(len(points), np.inf)
         for name in names
     ]
     nearest = np.min(distances, axis=0) if distances else np.full(len(points), np.inf)
@@ -202,7 +202,9 @@ def _clusters(points: np.ndarray, size: float) -> np.ndarray:
     cells = np.floor((points - points.min(axis=0)) / size).astype(int)
     taken = np.zeros(cells.max(axis=0) + 1, bool)
     taken[tuple(cells.T)] = True
-    return label(taken, np.ones((3, 3, 3)))[0][tuple(cells.T)]
+    numbers = np.zeros(taken.shape, int)
+    label(taken, np.ones((3, 3, 3)), output=numbers)
+    return numbers[tuple(cells.T)]
 
 
 def _near_robot(points: np.ndarray, base: np.ndarray, robot: Proprioception) -> np.ndarray:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vecenv.observations import PointCloud
 from voxposer.perception.cameras import DepthView
@@ -85,7 +85,7 @@ def without_outliers(cloud: PointCloud, radius: float, least_share: float) -> Po
 
 def clusters(points: np.ndarray, radius: float) -> np.ndarray:
     """Number of the cluster of each point [N, 3], int [N]: chains of points within a distance of each other."""
-    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
     links = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     return connected_components(links, directed=False)[1]
 
@@ -94,7 +94,7 @@ def fused(old: PointCloud, new: PointCloud, apart: float) -> PointCloud:
     """The new points, and the old ones farther than a distance from all of them."""
     if not len(old.points) or not len(new.points):
         return new if len(new.points) else old
-    away = cKDTree(new.points).query(old.points)[0] > apart
+    away = KDTree(new.points).query(old.points)[0] > apart
     return joined([new, kept(old, away)])
 
 
@@ -124,7 +124,7 @@ def axis_of(points: np.ndarray, bottom: float, views: Sequence[DepthView], toler
         views: of the cameras now.
         tolerance: of distances, metres.
     """
-    top, tree = float(points[:, 2].max()), cKDTree(points)
+    top, tree = float(points[:, 2].max()), KDTree(points)
     best, middle = -np.inf, middle_of(points)
     for share in _SHARES:
         tried = middle_of(points[points[:, 2] >= top - max(share * (top - bottom), 0.008)])
@@ -160,7 +160,7 @@ def support_under(points: np.ndarray, others: PointCloud, table: float) -> float
     level = below.points[below.normals[:, 2] > 0.9]
     if not len(level):
         return table
-    beside = cKDTree(points[:, :2]).query(level[:, :2])[0] < _BESIDE
+    beside = KDTree(points[:, :2]).query(level[:, :2])[0] < _BESIDE
     return max(table, float(np.percentile(level[beside, 2], 75))) if beside.any() else table
 
 

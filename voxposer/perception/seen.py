@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import binary_dilation
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vecenv.errors import NotFound
 from vecenv.manipulation.world import matrix
@@ -179,7 +179,7 @@ class SceneMemory:
             visible = view.view.shows(points, camera.tolerance)
             shown |= visible
             gone |= visible & ~self._is_shown(points, name, view)
-        away = cKDTree(now.points).query(points)[0] if len(now.points) else np.full(len(points), np.inf)
+        away = KDTree(now.points).query(points)[0] if len(now.points) else np.full(len(points), np.inf)
         gone |= shown & (away > 1.5 * camera.tolerance)
         if gone.sum() > camera.moved * max(int((gone | shown).sum()), 1):
             self._forget(name)
