@@ -1,4 +1,4 @@
-"""The method as a whole, for a batch: language in, each subtask planned on fresh ground truth and executed.
+"""The method as a whole, for a batch: language in, each subtask planned on a fresh observation and executed.
 
 An environment that speaks ``vecenv.contract`` and an :class:`~voxposer.language.llm.Llm` come in. In each round
 (:meth:`Agent.step`) every slot that has a subtask left plans it on one frozen snapshot (``voxposer.runtime``), and one
@@ -30,6 +30,7 @@ from voxposer.episode import (
 )
 from voxposer.following import FOLLOW, Following
 from voxposer.language.llm import Llm
+from voxposer.perception.sight import make_sight
 from voxposer.planned import PlannedMotion
 from voxposer.runtime import RuntimeConfig, Runtimes
 from voxposer.slots import FOLLOWED, Slot
@@ -100,8 +101,15 @@ class Agent:
         self._subtasks: list[tuple[str, ...]] = [()] * count
         self._index = np.zeros(count, int)
         self._instructions = list(instructions)
-        self._handles = self._runtimes.init(env.observe_objects().snapshot, episodes)
+        self._sight = make_sight(env, config.perception)
+        homes = self._sight.begin(range(count))
+        self._handles = self._runtimes.init([None] * count, episodes, homes)
         self.slots = [self._opened(*pair) for pair in zip(self._handles, instructions, strict=True)]
+
+    @property
+    def perception(self) -> str:
+        """Where observations come from, in words: ground truth, or which cameras and what segments their images."""
+        return self._sight.title
 
     @property
     def rule_based(self) -> bool:
@@ -115,10 +123,10 @@ class Agent:
             instructions: of every slot of the batch, B strings.
             slots: the slots that begin.
         """
-        snapshots = self.env.observe_objects(slots=slots).snapshot
+        homes = self._sight.begin(slots)
         for i in slots:
             self._runtimes.release([self._handles[i]])
-            (self._handles[i],) = self._runtimes.init([snapshots[i]], [episodes[i]] if episodes else ())
+            (self._handles[i],) = self._runtimes.init([None], [episodes[i]] if episodes else (), homes[[i]])
             self.slots[i] = self._opened(self._handles[i], instructions[i])
             self._instructions[i], self._subtasks[i] = instructions[i], ()
             self._index[i] = self._rounds[i] = 0
@@ -131,8 +139,10 @@ class Agent:
             LlmError: the model can be asked in no slot, whatever is tried (``permanent``).
         """
         live = [i for i, slot in enumerate(self.slots) if not self._finished[i] and not slot.cause]
-        snapshots = self.env.observe_objects(slots=live).snapshot
-        expanded = self._plan(live, snapshots)
+        seen = self._sight.look(live, [slot.grip.closed for slot in self.slots])
+        for i in live:
+            self.slots[i].missing = seen.error[i] or self._sight.unseen(i)
+        expanded = self._plan(live, seen.snapshot)
         ended = [i for i in live if self.slots[i].error or (self.slots[i].cause and not self.config.wait)]
         if ended:
             self.env.end_episodes(ended)

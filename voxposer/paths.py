@@ -148,7 +148,8 @@ def _mapped(interface: Interface, request: MotionRequest, config: PlannerConfig,
     goal = Stop(perception.position_of(end), request.rotation_at(end), request.closed_at_end(end))
     closed = perception.closed and request.closed_at(here)
     options = {"avoidance": request.avoidance, "planner": config, "route": route}
-    exact = tuple(int(index) for index in end) in perception.exact
+    # Where the hand is to grasp or let go, it is meant to be in among things, whoever chose the place.
+    exact = tuple(int(index) for index in end) in perception.exact or goal.closed != perception.closed
     found = plan_mapped(perception, goal, closed=closed, exact=exact, **options)
     perception.turns[request] = found.turn
     return found

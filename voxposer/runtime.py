@@ -137,12 +137,18 @@ class Runtimes:
 
     # -- handles -------------------------------------------------------------------------------------------------------
 
-    def init(self, snapshots: Sequence[ObjectsSnapshot | None], episodes: Sequence[str] = ()) -> list[str]:
+    def init(
+        self,
+        snapshots: Sequence[ObjectsSnapshot | None],
+        episodes: Sequence[str] = (),
+        homes: npt.ArrayLike | None = None,
+    ) -> list[str]:
         """Open an episode for each snapshot, which was taken before its first tick.
 
         Args:
-            snapshots: one an episode.
+            snapshots: one an episode; None where there is none yet.
             episodes: their names, by which saved replies are found; may be empty.
+            homes: poses of the hands, xyz + wxyz, [B, 7]; those of the snapshots if not given.
 
         Returns:
             Handles. An episode keeps its snapshot and its programs until :meth:`release`.
@@ -153,7 +159,10 @@ class Runtimes:
         if len(self) + len(snapshots) > self._most:
             raise HandleError(f"{len(self)} episodes are open, and {self._most} may be: release some first")
         handles = [secrets.token_hex(8) for _ in snapshots]
-        opened = [self._opened(*pair) for pair in zip(snapshots, episodes or ("",) * len(handles), strict=True)]
+        if homes is None:
+            homes = [np.zeros(7) if seen is None else seen.ee_pose for seen in snapshots]
+        wanted = zip(snapshots, episodes or ("",) * len(handles), np.asarray(homes, float), strict=True)
+        opened = [self._opened(*each) for each in wanted]
         self._slots |= dict(zip(handles, opened, strict=True))
         return handles
 
@@ -177,9 +186,8 @@ class Runtimes:
             raise HandleError(f"no open episode has the handle {handle!r}: it was released, or is of another process")
         return self._slots[handle]
 
-    def _opened(self, snapshot: ObjectsSnapshot | None, episode: str) -> Slot:
+    def _opened(self, snapshot: ObjectsSnapshot | None, episode: str, home: np.ndarray) -> Slot:
         interface = Interface()
-        home = np.zeros(7) if snapshot is None else snapshot.ee_pose.copy()
         lmps = build_lmps(
             interface.functions(),
             self._llm.for_episode(episode),
@@ -190,7 +198,7 @@ class Runtimes:
             undo=interface.restart,
             aside=self._turns.aside,
         )
-        return Slot("", lmps, interface, home, snapshot=snapshot)
+        return Slot("", lmps, interface, home.copy(), snapshot=snapshot)
 
     # -- language ------------------------------------------------------------------------------------------------------
 
@@ -212,7 +220,7 @@ class Runtimes:
             return
         slot.progress = replace(slot.progress, passes=slot.progress.passes + 1, subtasks=(), cursor=0)
         if slot.snapshot is None:
-            slot.stop("no ground truth: the slot's physics failed")
+            slot.stop(f"no observation: {slot.missing or 'the slot is not running'}")
             return
         try:
             slot.lmps.set_context((*slot.snapshot.names, *slot.snapshot.parts))
@@ -247,7 +255,7 @@ class Runtimes:
     def _observe(self, slot: Slot, snapshot: ObjectsSnapshot | None) -> None:
         slot.snapshot = snapshot
         if snapshot is None:
-            slot.stop("no ground truth: the slot's physics failed")
+            slot.stop(f"no observation: {slot.missing or 'the slot is not running'}")
             return
         try:
             perception, again = self._look(slot, snapshot), isinstance(slot.phase, Moving) and slot.phase.iterations
@@ -468,7 +476,7 @@ def _return_hand(slot: Slot) -> None:
 
 
 def _stop_with(slot: Slot, error: Exception) -> None:
-    slot.stop(_described(error))
+    slot.stop(f"{slot.missing} ({_described(error)})" if slot.missing else _described(error))
 
 
 def _end_with(slot: Slot, error: Exception) -> None:

@@ -33,6 +33,11 @@ _OF_MODELS = frozenset({"seed", "timeout_s", "attempts", "api_base", "options", 
 # Fields of every language program that may be given for all of them at once.
 _OF_LMPS = ("temperature", "max_tokens")
 _log = logging.getLogger(__name__)
+_SHORT = {
+    "perception": "perception.source",
+    "segmentation": "perception.camera.segmentation",
+    "cameras": "perception.camera.cameras",
+}
 _LEAST = {"passes": 1, "max_misses": 1, "idle_ticks": 1, "repairs": 0}
 
 
@@ -59,12 +64,13 @@ class Settings:
         Args:
             options: fields of ``LlmConfig`` (but no key), ``temperature`` and ``max_tokens`` of all language programs,
                 ``replay``, ``prompts_dir``, and fields of ``AgentConfig``; fields of the configs in it as
-                ``perception.map_size`` or as mappings.
+                ``perception.map_size`` or as mappings. ``perception``, ``segmentation`` and ``cameras`` are short for
+                ``perception.source``, ``perception.camera.segmentation`` and ``perception.camera.cameras``.
 
         Raises:
             InvalidInput: there is no such option, a value cannot be used, or a folder does not hold what it should.
         """
-        given = _nested(options)
+        given = _nested(_in_full(options))
         if _SECRET in given:
             raise InvalidInput(
                 f"option {_SECRET} is not taken, because options are stored with the results: "
@@ -170,7 +176,7 @@ def _below(usual: Any, given: Any) -> Any:
 
 def option_names() -> list[str]:
     """Every option, nested ones with dots."""
-    return [*_LLM, *_OF_LMPS, "replay", "prompts_dir", *_names_in(AgentConfig())]
+    return [*_LLM, *_OF_LMPS, *_SHORT, "replay", "prompts_dir", *_names_in(AgentConfig())]
 
 
 def _names_in(config: Any, before: str = "") -> Iterator[str]:
@@ -189,6 +195,22 @@ def _names_in(config: Any, before: str = "") -> Iterator[str]:
 def _is_table(value: object) -> bool:
     """Whether a value is a mapping of names to configs."""
     return isinstance(value, Mapping) and bool(value) and all(is_dataclass(each) for each in value.values())
+
+
+def _in_full(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options with short names in full."""
+    short = {name: full for name, full in _SHORT.items() if name in options and not isinstance(options[name], Mapping)}
+    camera = short.keys() - {"perception"}
+    if camera and options.get("perception", options.get("perception.source")) != "camera":
+        raise InvalidInput(f"{' and '.join(sorted(camera))}: options of perception=camera")
+    given = {name: value for name, value in options.items() if name not in short}
+    for name, full in short.items():
+        if full in given:
+            raise InvalidInput(f"option {name!r} was given twice, also as {full!r}")
+        value = options[name]
+        listed = name == "cameras" and isinstance(value, str)
+        given[full] = [part.strip() for part in value.split(",")] if listed else value
+    return given
 
 
 def _nested(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -243,6 +265,8 @@ def _hint(name: str, known: list[str]) -> str:
 
 def _plain(value: Any, hint: Any, where: str) -> Any:
     """A value of YAML or JSON as the type of a field has it: lists where tuples are, numbers that are finite."""
+    if isinstance(value, list):
+        hint = next((part for part in typing.get_args(hint) if typing.get_origin(part) is tuple), hint)
     if isinstance(value, list) and typing.get_origin(hint) is tuple:
         inner = [each for each in typing.get_args(hint) if each is not Ellipsis]
         parts = inner if len(inner) == len(value) else inner[:1] * len(value)

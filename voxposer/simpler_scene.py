@@ -8,6 +8,7 @@ for that robot. Objects get the names that the instructions use. Nothing of the 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -25,6 +26,10 @@ from vecenv.manipulation.routes import RouteConfig
 from vecenv.manipulation.world import Margins, matrix
 from vecenv.observations import Egocentric, Objects, ObjectsSnapshot, PointCloud
 from vecenv.placement import Placement
+from vecenv.simpler.assets.files import simpler_root
+from vecenv.simpler.control.chain import Chain
+from vecenv.simpler.control.robots import WIDOWX
+from vecenv.simpler.control.urdf import read_urdf
 from voxposer.agent import AgentConfig
 from voxposer.perception.config import PerceptionConfig
 from voxposer.planning.plan import PlanConfig, SubtaskPlan
@@ -63,6 +68,8 @@ NAMES: Mapping[str, str] = MappingProxyType(
 )
 # Distance of the tool from the robot's base at the start of an episode; the robot faces -x. Metres.
 _HOME_REACH = -0.28
+# Corners of the workspace, relative to the robot's base horizontally and to the table vertically, metres.
+_WORKSPACE = ((-0.585, -0.385, -0.07), (-0.035, 0.365, 0.43))
 # Samples of a table that the snapshot has no points of: half a side and distance, metres.
 _TABLE_HALF, _TABLE_STEP = 0.5, 0.1
 
@@ -71,18 +78,26 @@ class NoHandView(InvalidInput):
     """VoxPoser does not support this suite's robot; the message lists those it supports."""
 
 
-def widowx_config(passes: int = 3) -> AgentConfig:
+def widowx_config(passes: int = 3, seeing: PerceptionConfig = PerceptionConfig()) -> AgentConfig:  # noqa: B008  (frozen)
     """The agent's options for WidowX at 5 ticks a second, whose episodes last 60 or 120 ticks.
 
     Args:
         passes: how often an instruction is planned.
+        seeing: where observations come from; the rest of it is not used.
     """
     margins = Margins(
         gripper=WIDOWX_GRIPPER, above=0.05, corridor=0.06, narrow=0.02, easy_reach=0.40, least_room=0.002, retreat=0.06
     )
     # Empty, closed fingers stop 8 mm apart.
+    # The basket in the sink is in the photograph behind the scene, so it has no mask; its name has a colour.
+    camera = replace(seeing.camera, workspace=_WORKSPACE, colored=True)
     perception = PerceptionConfig(
-        margins=margins, held_box=(0.018, 0.008, 0.020), closed_gap=0.0095, home_reach=_HOME_REACH
+        source=seeing.source,
+        camera=camera,
+        margins=margins,
+        held_box=(0.018, 0.008, 0.020),
+        closed_gap=0.0095,
+        home_reach=_HOME_REACH,
     )
     # Waypoints are left within 1 cm and 0.1 rad, and a hand tilted so far loses a spoon: 3 more ticks at each stop.
     plan = PlanConfig(hold_ticks=3, settle=3, full_speed=0.03)
@@ -101,7 +116,7 @@ def hands(env: BatchEnv, suite: str, config: AgentConfig) -> tuple[BatchEnv, Age
         return env, config
     if suite != SUITE:
         raise NoHandView(f"voxposer knows Panda's and WidowX's hands: {SUITE} of SIMPLER's suites, not {suite}")
-    return HandView(env), widowx_config(config.passes)
+    return HandView(env), widowx_config(config.passes, config.perception)
 
 
 class HandView:
@@ -182,8 +197,29 @@ class HandView:
         return self.env.watched(watcher)
 
     def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
-        """Cameras and joints; images of some slots only, where ``slots`` says which."""
-        return self.env.observe_egocentric(slots)
+        """Cameras and joints, instances under the names that the instructions use; images of some slots only."""
+        seen = self.env.observe_egocentric(slots)
+        return replace(seen, instances=tuple(tuple(map(called, names)) for names in seen.instances))
+
+    @functools.cached_property
+    def _arm(self) -> Chain:
+        """Kinematics of the tool."""
+        root = simpler_root(getattr(self.env.config, "assets", None))
+        return read_urdf(root / WIDOWX.urdf_path()).chain(WIDOWX.tool, WIDOWX.joints)
+
+    def hand_state(self, seen: Egocentric) -> tuple[np.ndarray, np.ndarray]:
+        """Poses of the hands, xyz + wxyz, [B, 7], and distances of their pads from the middle, metres, [B, 2].
+
+        They follow from the joint positions and the pose of the base in the proprioception.
+        """
+        state = np.asarray(seen.state, float)
+        pos, rotation = self._arm.pose(state[:, : WIDOWX.dof])
+        turn = np.array([matrix(quat) for quat in state[:, -4:]])
+        tools = [
+            np.append(base[:3] + about @ p, quaternion(about @ r))
+            for base, about, p, r in zip(state[:, -7:], turn, pos, rotation, strict=True)
+        ]
+        return hand_poses(np.array(tools)), np.array([_pads(row) for row in state[:, list(WIDOWX.gripper)]])
 
     def close(self) -> None:
         """Release the simulator."""
@@ -234,7 +270,6 @@ class HandView:
 
 def view(snapshot: ObjectsSnapshot) -> ObjectsSnapshot:
     """A snapshot of ``simpler/bridge`` with the pose of the hand, distances of its pads and spoken names."""
-    left, right = np.maximum(snapshot.gripper - PAD_OFFSET, 0.0)
     return replace(
         snapshot,
         names=tuple(map(called, snapshot.names)),
@@ -245,8 +280,14 @@ def view(snapshot: ObjectsSnapshot) -> ObjectsSnapshot:
         movable=tuple(map(called, snapshot.movable)),
         scene=_with_table(snapshot),
         ee_pose=hand_poses(snapshot.ee_pose),
-        gripper=np.array([left, -right]),
+        gripper=_pads(snapshot.gripper),
     )
+
+
+def _pads(fingers: np.ndarray) -> np.ndarray:
+    """Distances of the pads from the middle [2], signed as Panda's, from the positions of WidowX's fingers."""
+    left, right = np.maximum(fingers - PAD_OFFSET, 0.0)
+    return np.array([left, -right])
 
 
 def called(name: str) -> str:

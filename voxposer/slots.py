@@ -194,6 +194,7 @@ class Slot:
         counts: what the episode took so far.
         latest: the subtask that was planned last.
         snapshot: the latest one, None where there is none.
+        missing: what the latest look did not find, in a sentence; "" for nothing.
     """
 
     instruction: str
@@ -206,6 +207,7 @@ class Slot:
     counts: Counts = field(default_factory=Counts)
     latest: Latest = field(default_factory=Latest)
     snapshot: ObjectsSnapshot | None = None
+    missing: str = ""
 
     @property
     def cause(self) -> str:

@@ -22,9 +22,6 @@ pytest.importorskip("litellm", reason="the extra voxposer is not installed")
 import vecenv
 from vecenv.contract import ResetInfo
 
-# Of a library that litellm uses.
-pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
 
 class Scene(Obedient):
     """One slot of libero_goal/8 with a cube and an obedient hand."""

@@ -26,9 +26,6 @@ pytest.importorskip("litellm", reason="the extra voxposer is not installed")
 from vecenv.contract import PlanControl
 from vecenv.observations import Objects
 
-# Of a library that litellm uses.
-pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
 
 class Table(FakeEnv):
     """The fake's episodes, with a cube in each slot, and plans whose waypoints each take a tick."""
@@ -171,7 +168,7 @@ def test_every_question_is_saved_and_answers_a_run_without_the_model(server: Llm
         (r.key, r.success, r.num_steps) for r in again.records
     ]
     assert [r.extras["questions"] for r in first.records] == [r.extras["questions"] for r in again.records]
-    assert again.summary.policy == "voxposer (openai/local, replayed)"
+    assert again.summary.policy == "voxposer (openai/local, replayed; perception: ground truth)"
 
 
 def test_a_replay_that_lacks_a_reply_ends_the_run_and_names_it(server: LlmServer, tmp_path: Path) -> None:
@@ -215,7 +212,7 @@ def test_unknown_tokens_and_price_are_null_and_known_ones_are_added(server: LlmS
         assert record.extras["llm_tokens"] == 18 * (record.extras["questions"] + record.extras["repairs"])
         assert record.extras["writer"] == "openai/local"
     text = markdown(result.summary)
-    assert "voxposer (openai/local)" in text
+    assert "voxposer (openai/local; perception: ground truth)" in text
     assert "- llm_cost_usd: 4 x unknown" in text
 
 

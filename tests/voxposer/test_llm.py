@@ -24,9 +24,6 @@ from voxposer.language.llm import Llm, LlmConfig
 from voxposer.language.replies import ReplyError, Usage
 from voxposer.language.reply_cache import ReplyCache
 
-# Of a library that litellm uses.
-pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[LlmServer]:

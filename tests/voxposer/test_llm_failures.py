@@ -22,9 +22,6 @@ from vecenv.util import caching
 from voxposer.language.llm import Llm, LlmConfig
 from voxposer.language.replies import LlmError, ReplyError, Usage
 
-# Of a library that litellm uses.
-pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[LlmServer]:

@@ -18,10 +18,6 @@ from voxposer.language.lmp import Lmps
 from voxposer.language.lmp_config import NAMES, LmpError
 from voxposer.language.observations import DynamicObservation, DynamicObservations, LazyMap, Observation
 
-# Of a library that litellm uses.
-pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
-
 # What the model is asked
 
 

@@ -22,10 +22,6 @@ from voxposer.language.prompts import code_in, load_prompts
 from voxposer.language.replies import LlmError, ReplyError
 from voxposer.sandbox.guard import Limits
 
-# Of a library that litellm uses.
-pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
-
-
 # Rights
 
 

@@ -24,8 +24,6 @@ from voxposer.language.saved import ReplayedLlm, SavedReplies, open_llm, to_line
 from voxposer.slots import Unanswered
 from voxposer.turns import Turns
 
-# Of a library that litellm uses.
-pytestmark = pytest.mark.filterwarnings("ignore:Item .* on TypedDict class:UserWarning")
 BAD = failure(400, "the prompt was refused")
 
 

@@ -91,7 +91,7 @@ def test_an_instruction_becomes_subtasks_and_errors_are_told_by_slot() -> None:
     found = table.planner(handles, ["lift", "nowhere", "lift"])
     assert found.subtask_list[0] == ("lift up", "lift up")
     assert found.subtask_count.tolist() == [2, 0, 0]
-    assert found.error == ("", "the planner found nothing to do", "no ground truth: the slot's physics failed")
+    assert found.error == ("", "the planner found nothing to do", "no observation: the slot is not running")
 
 
 def test_a_subtask_becomes_a_trajectory() -> None:

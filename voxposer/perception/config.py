@@ -11,9 +11,68 @@ from typing import Literal
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.world import Margins
 from voxposer.perception.grid import LEAST_MAP_SIZE, MAP_SIZE
+
+# Where observations come from, and how pixels get the names of objects.
+SOURCES = ("ground_truth", "camera")
+SEGMENTATIONS = ("renderer", "geometry")
+# The cameras that are used unless others are named.
+CAMERAS = ("agentview", "wrist")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """How depth images become objects. Metres unless noted.
+
+    Attributes:
+        cameras: names of the cameras; those that an environment does not have are an error. None for those of
+            agentview and wrist that it has.
+        segmentation: ``"renderer"``, the instance masks of the renderer; or ``"geometry"``, clusters over the table,
+            named by size and colour.
+        colored: an object without a mask is looked for by the colour in its name, as far as it has one.
+        largest_image: of larger images only every second, third, ... row and column is used, pixels.
+        tolerance: a camera sees through a point this far in front of what it sees.
+        voxel: seen points are averaged over voxels of this size.
+        most_points: of an object; voxels are enlarged until there are no more.
+        most_fixture_points: of a fixture.
+        cluster: points within this distance of each other belong together.
+        least_points: pixels by which an object is seen at all.
+        moved: share of an object's remembered points in view that are not seen again, from which it has moved.
+        fixed: an object that is longer than this, horizontally, is taken to be a fixture.
+        on_table: a surface this close to the table belongs to it.
+        rests: an object whose lowest seen point is this close to the table stands on it.
+        hollow: a space that is open to above and deeper than this can hold things.
+        sticks_out: what extends this far over the outline of a fixture's top is an open drawer.
+        workspace: lower and upper corner of the workspace, relative to the robot's base horizontally and to the table
+            vertically, [2, 3].
+    """
+
+    cameras: tuple[str, ...] | None = None
+    segmentation: str = "renderer"
+    colored: bool = False
+    largest_image: int = 320
+    tolerance: float = 0.008
+    voxel: float = 0.004
+    most_points: int = 600
+    most_fixture_points: int = 2500
+    cluster: float = 0.02
+    least_points: int = 12
+    moved: float = 0.25
+    fixed: float = 0.25
+    on_table: float = 0.003
+    rests: float = 0.025
+    hollow: float = 0.06
+    sticks_out: float = 0.06
+    workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-0.1, -0.5, -0.09), (0.9, 0.5, 0.36))
+
+    def __post_init__(self) -> None:
+        if self.segmentation not in SEGMENTATIONS:
+            raise InvalidInput(f"segmentation={self.segmentation!r}: expected one of {', '.join(SEGMENTATIONS)}")
+        if self.cameras is not None and (isinstance(self.cameras, str) or not all(self.cameras) or not self.cameras):
+            raise InvalidInput(f"cameras={self.cameras!r}: give a sequence of names of cameras, or None")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +80,8 @@ class PerceptionConfig:
     """How objects are seen and grasped. Metres unless noted.
 
     Attributes:
+        source: ``"ground_truth"``, what ``observe_objects`` returns; or ``"camera"``, depth images.
+        camera: how depth images become objects.
         margins: of picking and placing.
         held_box: half extents of the space between the pads, along the hand's x, y (closing) and z. While the fingers
             are closed around something, an object with points in this space is held. The closing half extent is added
@@ -47,6 +108,8 @@ class PerceptionConfig:
         ValueError: there are no such fields.
     """
 
+    source: str = "ground_truth"
+    camera: CameraConfig = field(default_factory=CameraConfig)
     margins: Margins = field(default_factory=lambda: Margins(gripper=Gripper(wrist=0.14), grasp_tilts=(0.3, 0.6)))
     held_box: tuple[float, float, float] = (0.020, 0.006, 0.022)
     closed_gap: float = 0.0015
@@ -70,6 +133,16 @@ class PerceptionConfig:
             raise ValueError(f"map_size must be at least {LEAST_MAP_SIZE}, not {self.map_size}")
         if self.fields not in ("geometry", "centroid"):
             raise ValueError(f"fields must be 'geometry' or 'centroid', got {self.fields!r}")
+        if self.source not in SOURCES:
+            raise InvalidInput(f"perception={self.source!r}: expected one of {', '.join(SOURCES)}")
+
+    @property
+    def title(self) -> str:
+        """How results name it: "ground truth", or "camera" and what segments its images."""
+        if self.source == "ground_truth":
+            return "ground truth"
+        masks = {"renderer": "renderer masks", "geometry": "segmented by geometry"}[self.camera.segmentation]
+        return f"camera, {masks}"
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from voxposer.agent import Agent, PlannedMotion
 from voxposer.language.lmp_config import Call
 from voxposer.language.replies import LlmError, Usage
 from voxposer.language.saved import to_lines
+from voxposer.perception.config import CAMERAS
 from voxposer.settings import Settings
 from voxposer.simpler_scene import hands
 from voxposer.slots import Slot
@@ -40,7 +41,7 @@ class VoxPoserPolicy:
             ``planner.max_steps``, ...
 
     Attributes:
-        name: how the policy is called in results, the model included.
+        name: how the policy is called in results, the model and the perception included.
         settings: the options.
         agent: what drives the present batch.
         on_planned: called with every motion as it is planned, if set before ``reset``.
@@ -55,10 +56,16 @@ class VoxPoserPolicy:
             self._llm = self.settings.open_llm()
         except (InvalidInput, InvalidFile) as error:
             raise PolicyError(str(error)) from error
-        self.name = f"voxposer ({self.settings.writer})"
+        seeing = self.settings.agent_config().perception
+        self.name = f"voxposer ({self.settings.writer}; perception: {seeing.title})"
         self.agent: Agent | None = None
         self.on_planned: Callable[[PlannedMotion], None] | None = None
         self._episodes: tuple[str, ...] = ()
+
+    def needed_cameras(self) -> tuple[str, ...]:
+        """The cameras whose depth images are read; none with ground truth."""
+        seeing = self.settings.agent_config().perception
+        return (seeing.camera.cameras or CAMERAS[:1]) if seeing.source == "camera" else ()
 
     def reset(self, env: BatchEnv, info: ResetInfo) -> None:
         """Begin with a freshly placed batch, and let go of the one before."""
@@ -140,6 +147,7 @@ def report(agent: Agent, index: int) -> dict[str, Any]:
     slot = agent.slots[index]
     calls = slot.lmps.trace
     return {
+        "perception": agent.perception,
         "subtasks": slot.progress.begun,
         "passes": slot.progress.passes,
         "waypoints": slot.counts.waypoints,
