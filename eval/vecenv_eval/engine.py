@@ -57,6 +57,8 @@ class Engine(Protocol):
 
     in_process: ClassVar[bool]
 
+    def __init__(self, config: EvalConfig) -> None: ...
+
     def run(
         self, evaluation: Evaluation, store: ResultStore, index: int, on_progress: Callable[[Progress], None]
     ) -> Outcome:

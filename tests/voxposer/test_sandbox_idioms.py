@@ -69,7 +69,8 @@ def test_random_programs_end_as_in_python() -> None:
         assert (refused is None) == (raised is None), (source, refused, raised)
         if refused is not None and raised is not None:
             assert issubclass(refused, raised) or issubclass(raised, refused), (source, refused, raised)
-        for name in ("a", "b", "c", "log") if found else ():
+        for name in () if found is None else ("a", "b", "c", "log"):
+            assert found is not None
             assert repr(found.variables.get(name)) == repr(expected.get(name)), source
         compared += 1
     assert compared > 350

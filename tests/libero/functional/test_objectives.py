@@ -139,7 +139,7 @@ def test_carrying_to_a_place_pays_for_every_stage() -> None:
     hand = data.site_xpos[grip].copy()
     potentials = {}
 
-    def at(stage: str, place: np.ndarray, gripper: float = OPEN, held: bool = False) -> None:
+    def at(stage: str, place: np.ndarray, gripper: np.ndarray = OPEN, held: bool = False) -> None:
         put_soup(data, place)
         if held:
             data.site_xpos[grip] = place

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -143,18 +143,18 @@ def _views(physics: Physics, number: int, rows: np.ndarray) -> tuple[View, Robot
     """What is observed of some slots of a group, float32; leaves have a leading axis."""
     group = physics.groups[number]
     slots, none = group.slots[rows], np.zeros(len(rows))
-    view = View(
-        qpos=group.qpos[rows],
-        xpos=group.xpos[rows],
-        xquat=group.xquat[rows],
-        site_xpos=group.site_xpos[rows],
-        site_xmat=group.site_xmat[rows].reshape(len(rows), -1, 3, 3),
-        touch=group.touch[rows],
-        gripper=np.stack([none, none], axis=1),
-        start_height=none,
-    )
-    robot = Robot(group.qvel[rows], physics.fingers[slots], physics.eef_pos[slots], physics.eef_quat[slots])
-    return jax.tree.map(lambda x: np.asarray(x, np.float32), (view, robot))
+    view: dict[str, Any] = {
+        "qpos": group.qpos[rows],
+        "xpos": group.xpos[rows],
+        "xquat": group.xquat[rows],
+        "site_xpos": group.site_xpos[rows],
+        "site_xmat": group.site_xmat[rows].reshape(len(rows), -1, 3, 3),
+        "touch": group.touch[rows],
+        "gripper": np.stack([none, none], axis=1),
+        "start_height": none,
+    }
+    robot: list[Any] = [group.qvel[rows], physics.fingers[slots], physics.eef_pos[slots], physics.eef_quat[slots]]
+    return jax.tree.map(lambda x: np.asarray(x, np.float32), (View(**view), Robot(*robot)))
 
 
 def _alike(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
