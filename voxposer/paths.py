@@ -43,10 +43,12 @@ def plan_paths(
     config: PlannerConfig,
     route: RouteConfig,
     maps_of: dict[int, PlannedOn] | None = None,
+    then: Sequence[MotionRequest | None] = (),
 ) -> list[np.ndarray | InterfaceError]:
     """A path [P, 3] in voxels for each request: empty for one without targets, an error where there is no path.
 
-    The maps that paths were planned on are put into ``maps_of``, if given, by index of request.
+    The maps that paths were planned on are put into ``maps_of``, if given, by index of request. ``then`` are the
+    motions that were asked for after these, if any.
     """
     kept: dict[int, PlannedOn] = {} if maps_of is None else maps_of
     paths: list[np.ndarray | InterfaceError] = [np.zeros((0, 3)) for _ in wants]
@@ -59,7 +61,7 @@ def plan_paths(
             try:
                 if not travels(*wants[i], route):
                     continue
-                found = _mapped(*wants[i], config, route)
+                found = _mapped(*wants[i], then[i] if then else None, config, route)
                 paths[i], kept[i] = found.path, PlannedOn(found.avoidance, found.value)
             except InterfaceError as error:
                 paths[i] = error
@@ -135,7 +137,13 @@ def travels(interface: Interface, request: MotionRequest, route: RouteConfig) ->
     return not request.object_centric and not is_contact_motion(interface.perception, request, route)
 
 
-def _mapped(interface: Interface, request: MotionRequest, config: PlannerConfig, route: RouteConfig) -> MappedPath:
+def _mapped(
+    interface: Interface,
+    request: MotionRequest,
+    then: MotionRequest | None,
+    config: PlannerConfig,
+    route: RouteConfig,
+) -> MappedPath:
     """The path of a request over configuration-space maps; where it turns is kept in the view.
 
     Raises:
@@ -149,7 +157,8 @@ def _mapped(interface: Interface, request: MotionRequest, config: PlannerConfig,
     closed = perception.closed and request.closed_at(here)
     options = {"avoidance": request.avoidance, "planner": config, "route": route}
     # Where the hand is to grasp or let go, it is meant to be in among things, whoever chose the place.
-    exact = tuple(int(index) for index in end) in perception.exact or goal.closed != perception.closed
+    last = then.closed_at_end(end) if then is not None and then.kind == "stay" else goal.closed
+    exact = tuple(int(index) for index in end) in perception.exact or last != perception.closed
     found = plan_mapped(perception, goal, closed=closed, exact=exact, **options)
     perception.turns[request] = found.turn
     return found

@@ -381,7 +381,8 @@ class Runtimes:
         while waiting:
             wants = [(slots[i].interface, slots[i].requests[0]) for i in waiting]
             kept: dict[int, PlannedOn] = {}
-            paths = plan_paths(wants, self.config.planner, self.config.route, kept if self._on_planned else None)
+            then = [slots[i].requests[1] if len(slots[i].requests) > 1 else None for i in waiting]
+            paths = plan_paths(wants, self.config.planner, self.config.route, kept if self._on_planned else None, then)
             for row, (i, path) in enumerate(zip(waiting, paths, strict=True)):
                 stops = self._plan_motion(i, slots[i], path, kept.get(row))
                 motions[i] += [stops] if stops else []
