@@ -1,7 +1,7 @@
 """What VoxPoser's success rests on: the same episodes with one part replaced at a time.
 
     python benchmarks/voxposer_ablation.py
-    python benchmarks/voxposer_ablation.py --suites libero_object --tasks 0-9 --episodes 0-2 --variants shipped,straight
+    python benchmarks/voxposer_ablation.py --suites libero_object --tasks 0-9 --episodes 0-2 --variants map,straight
 
 Each variant (``voxposer_variants.VARIANTS``) is a setting of public config fields. A row is a variant on a suite: how
 many episodes it solved, with a 95 % Wilson interval, and mean control steps. Every episode is stored as it ends in the
@@ -22,11 +22,12 @@ from vecenv_eval.report import wilson
 from vecenv_eval.results import begin, resume
 from vecenv_eval.runner import evaluate
 from vecenv_eval.store import Record, ResultStore
-from voxposer_variants import ARGUMENTS, VARIANTS, why_missing
+from voxposer_variants import VARIANTS
 
 SUITES = ("libero_object", "libero_spatial", "libero_goal", "libero_10")
 # What a variant reads of the simulator beyond images and joints.
 POSES, FIELDS = "poses and surfaces", "grasps and places"
+PRIVILEGES = {"centroid": POSES, "camera": "names of pixels"}
 
 
 def main() -> None:
@@ -35,40 +36,36 @@ def main() -> None:
     parser.add_argument("--suites", default=",".join(SUITES))
     parser.add_argument("--tasks", default="all")
     parser.add_argument("--episodes", default="0-9")
-    parser.add_argument("--variants", default=",".join((*VARIANTS, *ARGUMENTS)))
+    parser.add_argument("--variants", default=",".join(VARIANTS))
     parser.add_argument("--num-envs", type=int, default=30)
     parser.add_argument("--work", type=Path, default=ROOT / "results" / "voxposer_ablation")
     parser.add_argument("--report", action="store_true", help="run nothing; report what the folder has")
     options = parser.parse_args()
-    unknown = [name for name in options.variants.split(",") if name not in {**VARIANTS, **ARGUMENTS}]
+    unknown = [name for name in options.variants.split(",") if name not in VARIANTS]
     if unknown:
-        parser.error(f"no variant {unknown[0]!r}; there are {', '.join((*VARIANTS, *ARGUMENTS))}")
-    rows, skipped = [], {}
+        parser.error(f"no variant {unknown[0]!r}; there are {', '.join(VARIANTS)}")
+    rows = []
     for suite in options.suites.split(","):
         for variant in options.variants.split(","):
-            if reason := why_missing(variant):
-                skipped[variant] = reason
-                continue
             row = run(suite, variant, options)
             if row:
                 rows.append(row)
-                write(rows, skipped)
-    for variant, reason in skipped.items():
-        print(f"{variant}: {reason}")
+                write(rows)
     if not rows:
         raise SystemExit(f"{options.work}: no episodes of these variants yet")
 
 
-def write(rows: list[dict[str, Any]], skipped: dict[str, str]) -> None:
+def write(rows: list[dict[str, Any]]) -> None:
     """The table and the results file."""
     about = {name: variant.about for name, variant in VARIANTS.items()}
-    notes = {"privileged": PRIVILEGED, "variants": about, "skipped": skipped}
+    notes = {"privileged": PRIVILEGED, "variants": about}
     report("voxposer_ablation", rows, title="VoxPoser (offline/libero), one part replaced at a time", notes=notes)
 
 
 PRIVILEGED = (
-    "All variants here read ground truth of the simulator: names, poses and surface points of objects and parts. All "
-    "but 'centroid' also use grasps and places computed on it. Programs are written by rules, not by a language model."
+    "All variants but 'camera' read ground truth of the simulator: names, poses and surface points of objects and "
+    "parts. All of them but 'centroid' also use grasps and places computed on it. Programs are written by rules, not "
+    "by a language model."
 )
 
 
@@ -80,7 +77,7 @@ def run(suite: str, variant: str, options: argparse.Namespace) -> dict[str, Any]
         records = tuple(ResultStore.open(folder).records().values()) if begun else ()
     else:
         asked = {"tasks": options.tasks, "episodes": options.episodes, "num_envs": options.num_envs}
-        policy = {"policy": "voxposer_variants:VariantPolicy", "policy_args": {"variant": variant}}
+        policy = {"policy": "voxposer", "policy_args": dict(VARIANTS[variant].options)}
         config = EvalConfig(suite=suite, **policy, **asked)
         config, store = resume(folder, **asked) if begun else (config, begin(config, folder))
         records = evaluate(config, store).records
@@ -94,7 +91,7 @@ def row_of(suite: str, variant: str, records: Sequence[Record]) -> dict[str, Any
     return {
         "suite": suite,
         "variant": variant,
-        "privileged": POSES if variant == "centroid" else f"{POSES}, {FIELDS}",
+        "privileged": PRIVILEGES.get(variant, f"{POSES}, {FIELDS}"),
         "episodes": len(records),
         "solved": solved,
         "rate": round(solved / len(records), 3),

@@ -30,7 +30,8 @@ from typing import Any
 import mujoco
 import numpy as np
 from common import ROOT, report
-from voxposer_variants import VARIANTS, VariantPolicy
+from vecenv_eval.policies.voxposer import VoxPoserPolicy
+from voxposer_variants import VARIANTS
 
 import vecenv
 from vecenv.libero.env import LiberoEnv
@@ -204,7 +205,7 @@ def run(numbers: Sequence[int], variant: str) -> list[Outcome]:
     """Run scenes of one suite as one batch."""
     scenes = [SCENES[number] for number in numbers]
     tasks, episodes = [scene.task for scene in scenes], [scene.episode for scene in scenes]
-    policy = VariantPolicy(variant)
+    policy = VoxPoserPolicy(**VARIANTS[variant].options)
     with vecenv.make(scenes[0].suite, tasks=[0], episodes=list(range(len(scenes)))) as env:
         assert isinstance(env, LiberoEnv)
         env.set_episodes(tasks=tasks, episodes=episodes)
