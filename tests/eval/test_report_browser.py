@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.browser import chromium
 from support.results_folders import some_records, write_results
 from vecenv_eval.report.html import page
 from vecenv_eval.report.run import read_run
@@ -26,13 +27,8 @@ WIDE, PHONE = {"width": 1100, "height": 900}, {"width": 400, "height": 800}
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with api.sync_playwright() as playwright:
-        try:
-            chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-        except api.Error:
-            pytest.skip("needs a Chromium: apt-get install chromium, or playwright install chromium")
-        yield chromium
-        chromium.close()
+    with chromium() as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

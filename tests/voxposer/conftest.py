@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+
+from vecenv.util import caching
+from voxposer.language.llm import LlmConfig
 
 if TYPE_CHECKING:
     from support.llm_server import LlmServer
@@ -19,6 +23,27 @@ def running() -> Iterator[LlmServer]:
 
     with serving() as server:
         yield server
+
+
+@pytest.fixture
+def server(running: LlmServer) -> LlmServer:
+    """The same, with nothing asked yet."""
+    running.requests.clear()
+    running.say("pass")
+    return running
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of this test's own."""
+    monkeypatch.setenv(caching.VARIABLE, str(tmp_path))
+    return tmp_path / "llm"
+
+
+@pytest.fixture
+def config(server: LlmServer, folder: Path) -> LlmConfig:
+    """Settings that ask it."""
+    return LlmConfig(model="openai/local", api_base=server.base, api_key="secret", timeout_s=5, attempts=4, backoff_s=2)
 
 
 @pytest.fixture

@@ -7,14 +7,13 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.llm_server import Answer, LlmServer, code, serving
+from support.llm_server import Answer, LlmServer, code
 from support.lmps import QUESTION, Model
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
@@ -23,32 +22,6 @@ from vecenv.util import caching
 from voxposer.language.llm import Llm, LlmConfig
 from voxposer.language.replies import ReplyError, Usage
 from voxposer.language.reply_cache import ReplyCache
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[LlmServer]:
-    with serving() as server:
-        yield server
-
-
-@pytest.fixture
-def server(running: LlmServer) -> LlmServer:
-    running.requests.clear()
-    running.say("pass")
-    return running
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache of this test's own."""
-    monkeypatch.setenv(caching.VARIABLE, str(tmp_path))
-    return tmp_path / "llm"
-
-
-@pytest.fixture
-def config(server: LlmServer, folder: Path) -> LlmConfig:
-    return LlmConfig(model="openai/local", api_base=server.base, api_key="secret", timeout_s=5, attempts=4, backoff_s=2)
-
 
 # The question and the answer
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -13,40 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.llm_server import HANG, Answer, LlmServer, code, failure, serving
+from support.llm_server import HANG, Answer, LlmServer, code, failure
 from support.lmps import QUESTION, Model
 
 pytest.importorskip("litellm", reason="the extra voxposer is not installed")
 
-from vecenv.util import caching
 from voxposer.language.llm import Llm, LlmConfig
 from voxposer.language.replies import LlmError, ReplyError, Usage
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[LlmServer]:
-    with serving() as server:
-        yield server
-
-
-@pytest.fixture
-def server(running: LlmServer) -> LlmServer:
-    running.requests.clear()
-    running.say("pass")
-    return running
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache of this test's own."""
-    monkeypatch.setenv(caching.VARIABLE, str(tmp_path))
-    return tmp_path / "llm"
-
-
-@pytest.fixture
-def config(server: LlmServer, folder: Path) -> LlmConfig:
-    return LlmConfig(model="openai/local", api_base=server.base, api_key="secret", timeout_s=5, attempts=4, backoff_s=2)
-
 
 # Failures that pass
 

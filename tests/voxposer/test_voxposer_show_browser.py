@@ -7,12 +7,12 @@ the browser shows is kept there.
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.browser import chromium
 from test_voxposer_show import shown
 
 from voxposer.show import render_page
@@ -24,13 +24,8 @@ FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with api.sync_playwright() as playwright:
-        try:
-            chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
-        except api.Error:
-            pytest.skip("needs a Chromium: apt-get install chromium, or playwright install chromium")
-        yield chromium
-        chromium.close()
+    with chromium(FLAGS) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

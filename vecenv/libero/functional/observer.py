@@ -157,6 +157,7 @@ def _views(physics: Physics, number: int, rows: np.ndarray) -> tuple[View, Robot
     return jax.tree.map(lambda x: np.asarray(x, np.float32), (View(**view), Robot(*robot)))
 
 
+@functools.lru_cache(maxsize=64)
 def _alike(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:
     """Whether two models have the same bodies, joints and sites; their geoms may differ."""
 
