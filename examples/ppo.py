@@ -76,6 +76,8 @@ class PPOConfig:
         hidden: widths of the hidden layers of policy and value function.
         initial_std: of the noise on actions; learnt from there on.
         min_std: it never gets smaller than this, so that something remains to be found out.
+        min_std_gripper: the same for the last action, of which the simulator takes the sign only: a policy sure of
+            its sign would never again try the other one with the deviation that motions need.
         seed: of everything random.
     """
 
@@ -95,6 +97,7 @@ class PPOConfig:
     hidden: tuple[int, ...] = (256, 256, 128)
     initial_std: float = 0.6
     min_std: float = 0.05
+    min_std_gripper: float = 0.05
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -275,10 +278,16 @@ def apply_layers(layers: Layers, x: jax.Array) -> jax.Array:
     return x @ layers[-1]["weight"] + layers[-1]["bias"]
 
 
-def policy_of(networks: Networks, obs: Obs, min_std: float = 0.05) -> tuple[jax.Array, jax.Array]:
-    """Mean [..., A] in (-1, 1) and standard deviation [A] of the action for normalised observations."""
-    std = jnp.exp(jnp.clip(networks.log_std, math.log(min_std), 0.5))
-    return jnp.tanh(apply_layers(networks.policy, features(networks, obs))), std
+def mean_of(networks: Networks, obs: Obs) -> jax.Array:
+    """Mean of the action for normalised observations, [..., A] in (-1, 1)."""
+    return jnp.tanh(apply_layers(networks.policy, features(networks, obs)))
+
+
+def std_of(networks: Networks, config: PPOConfig) -> jax.Array:
+    """Standard deviation of the action, [A]."""
+    least = jnp.full(len(networks.log_std), config.min_std)
+    least = least.at[-1].max(config.min_std_gripper)
+    return jnp.exp(jnp.clip(networks.log_std, jnp.log(least), 0.5))
 
 
 def value_of(networks: Networks, obs: Obs) -> jax.Array:
@@ -383,7 +392,7 @@ def rollout(
     def tick(worlds: Worlds, rng: jax.Array) -> tuple[Worlds, tuple[Transition, Statistics]]:
         act, reset = jax.random.split(rng)
         obs = packed(worlds.state.obs)
-        mean, std = policy_of(networks, normalizer(obs), config.min_std)
+        mean, std = mean_of(networks, normalizer(obs)), std_of(networks, config)
         action = mean + noise * std * jax.random.normal(act, mean.shape)
         after, reward = advance(env, worlds.state, action, config.action_repeat)
         terminated = after.done > 0
@@ -473,7 +482,7 @@ class Batch(NamedTuple):
 
 def loss_of(networks: Networks, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The clipped objective (Schulman et al. 2017, eq. 9), and what to watch."""
-    mean, std = policy_of(networks, batch.obs, config.min_std)
+    mean, std = mean_of(networks, batch.obs), std_of(networks, config)
     log_ratio = log_probability(mean, std, batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)

@@ -90,7 +90,7 @@ class PpoPolicy:
         # It is never stepped, so it needs no memory for contacts.
         env = ppo.make_env(args, scenes=None, impl="jax", budget=Budget(contacts=1, rows=1, pairs=1, candidates=1))
         learnt = ppo.load_policy(folder, ppo.acting(env, args.action))
-        mean = jax.jit(lambda obs: ppo.policy_of(learnt.networks, learnt.normalizer(ppo.packed(obs)))[0])
+        mean = jax.jit(lambda obs: ppo.mean_of(learnt.networks, learnt.normalizer(ppo.packed(obs))))
 
         def act(obs: np.ndarray) -> np.ndarray:
             action = np.asarray(mean(obs), np.float64)

@@ -138,13 +138,22 @@ def test_images_are_seen_by_policy_and_value_function() -> None:
     np.testing.assert_allclose(obs.images[..., 1] / 255, views["pixels/view_1"][..., 0], atol=0.5 / 255 + 1e-6)
 
     def outcome(networks: Any) -> jax.Array:
-        return ppo.policy_of(networks, obs)[0].sum() + ppo.value_of(networks, obs).sum()
+        return ppo.mean_of(networks, obs).sum() + ppo.value_of(networks, obs).sum()
 
     gradient = jax.grad(outcome)(networks)
     assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient.vision))
     blank = obs._replace(images=jnp.zeros_like(obs.images))
     assert np.abs(ppo.value_of(networks, obs) - ppo.value_of(networks, blank)).max() > 0
     assert ppo.Normalizer(jnp.ones(()), jnp.zeros(3), jnp.ones(3))(obs).images is obs.images
+
+
+def test_noise_has_least_deviations_and_the_gripper_its_own() -> None:
+    networks = ppo.init_networks(jax.random.key(0), Flags((36, 36, 1)), SMALL)
+    networks = networks._replace(log_std=jnp.full_like(networks.log_std, -9))
+    config = dataclasses.replace(SMALL, min_std=0.1, min_std_gripper=0.7)
+    std = np.asarray(ppo.std_of(networks, config))
+    np.testing.assert_allclose(std, [0.1] * (len(std) - 1) + [0.7], rtol=1e-6)
+    np.testing.assert_allclose(ppo.std_of(networks, dataclasses.replace(config, min_std_gripper=0.01)), 0.1, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +187,7 @@ def test_what_was_learnt_acts_in_an_evaluation(tmp_path: Path, monkeypatch: pyte
         policy.reset(env, info)
         actions = policy.act(env)
         obs = own.Obs(jnp.asarray(inner.observe_batch(env.physics)), None)
-        mean = np.asarray(own.policy_of(networks, normalizer(obs))[0])
+        mean = np.asarray(own.mean_of(networks, normalizer(obs)))
         assert actions.shape == (2, 2, 7)
         np.testing.assert_allclose(actions[:, 0][:, [0, 1, 2, 6]], mean, atol=1e-6)
         np.testing.assert_array_equal(actions[:, 0], actions[:, 1])
