@@ -76,8 +76,8 @@ class PPOConfig:
         hidden: widths of the hidden layers of policy and value function.
         initial_std: of the noise on actions; learnt from there on.
         min_std: it never gets smaller than this, so that something remains to be found out.
-        min_std_gripper: the same for the last action, of which the simulator takes the sign only: a policy sure of
-            its sign would never again try the other one with the deviation that motions need.
+        switches: how many of the last numbers of an action are -1 or 1, drawn with a probability of each of at least
+            2 %; the gripper's, of which the simulator takes the sign only, is one.
         seed: of everything random.
     """
 
@@ -97,7 +97,7 @@ class PPOConfig:
     hidden: tuple[int, ...] = (256, 256, 128)
     initial_std: float = 0.6
     min_std: float = 0.05
-    min_std_gripper: float = 0.05
+    switches: int = 0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -149,6 +149,8 @@ class Environment(Protocol):
 Layers = list[dict[str, jax.Array]]
 # Convolutions over images: (output channels, side of the kernel, stride), then a layer of so many numbers.
 CONVOLUTIONS, SEEN = ((32, 8, 4), (64, 4, 2), (64, 3, 1)), 256
+# The largest logit of a switch: each side keeps a probability of 2 %.
+SUREST = 4.0
 
 
 class Obs(NamedTuple):
@@ -279,26 +281,56 @@ def apply_layers(layers: Layers, x: jax.Array) -> jax.Array:
 
 
 def mean_of(networks: Networks, obs: Obs) -> jax.Array:
-    """Mean of the action for normalised observations, [..., A] in (-1, 1)."""
+    """The action without noise for normalised observations, [..., A] in (-1, 1); of switches the sign counts."""
     return jnp.tanh(apply_layers(networks.policy, features(networks, obs)))
 
 
-def std_of(networks: Networks, config: PPOConfig) -> jax.Array:
-    """Standard deviation of the action, [A]."""
-    least = jnp.full(len(networks.log_std), config.min_std)
-    least = least.at[-1].max(config.min_std_gripper)
-    return jnp.exp(jnp.clip(networks.log_std, jnp.log(least), 0.5))
+class Actions(NamedTuple):
+    """A distribution of actions: normal ones, and after them S switches, which are -1 or 1.
+
+    Attributes:
+        mean: of the normal ones, [..., A - S].
+        std: their standard deviations, [A - S].
+        logits: of the switches' being 1, [..., S].
+    """
+
+    mean: jax.Array
+    std: jax.Array
+    logits: jax.Array
+
+    def draw(self, rng: jax.Array, noise: jax.Array) -> jax.Array:
+        """Actions [..., A]; with a ``noise`` of 0 the likeliest."""
+        normal, uniform = jax.random.split(rng)
+        moves = self.mean + noise * self.std * jax.random.normal(normal, self.mean.shape)
+        chance = jnp.where(noise > 0, jax.nn.sigmoid(self.logits), self.logits > 0)
+        switches = jnp.where(jax.random.uniform(uniform, self.logits.shape) < chance, 1.0, -1.0)
+        return jnp.concatenate([moves, switches], axis=-1)
+
+    def log_probability(self, action: jax.Array) -> jax.Array:
+        """Of actions [..., A] before the environment clips them, [...]."""
+        moves, switches = jnp.split(action, [len(self.std)], axis=-1)
+        z = (moves - self.mean) / self.std
+        normal = -jnp.sum(0.5 * z**2 + jnp.log(self.std) + 0.5 * math.log(2 * math.pi), axis=-1)
+        return normal - jnp.sum(jax.nn.softplus(-switches * self.logits), axis=-1)
+
+    def entropy(self) -> jax.Array:
+        """Mean entropy, but for a constant."""
+        chance = jax.nn.sigmoid(self.logits)
+        switches = jax.nn.softplus(self.logits) - chance * self.logits
+        return jnp.sum(jnp.log(self.std)) + jnp.sum(switches, axis=-1).mean()
+
+
+def actions_of(networks: Networks, obs: Obs, config: PPOConfig) -> Actions:
+    """What the policy does for normalised observations."""
+    raw = apply_layers(networks.policy, features(networks, obs))
+    moves, switches = jnp.split(raw, [raw.shape[-1] - config.switches], axis=-1)
+    std = jnp.exp(jnp.clip(networks.log_std[: moves.shape[-1]], math.log(config.min_std), 0.5))
+    return Actions(jnp.tanh(moves), std, SUREST * jnp.tanh(switches / SUREST))
 
 
 def value_of(networks: Networks, obs: Obs) -> jax.Array:
     """Expected discounted reward from normalised observations on, [...]."""
     return apply_layers(networks.value, features(networks, obs))[..., 0]
-
-
-def log_probability(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array:
-    """Of an action of a normal distribution, before the environment clips it, [...]."""
-    z = (action - mean) / std
-    return -jnp.sum(0.5 * z**2 + jnp.log(std) + 0.5 * math.log(2 * math.pi), axis=-1)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -392,13 +424,13 @@ def rollout(
     def tick(worlds: Worlds, rng: jax.Array) -> tuple[Worlds, tuple[Transition, Statistics]]:
         act, reset = jax.random.split(rng)
         obs = packed(worlds.state.obs)
-        mean, std = mean_of(networks, normalizer(obs)), std_of(networks, config)
-        action = mean + noise * std * jax.random.normal(act, mean.shape)
+        actions = actions_of(networks, normalizer(obs), config)
+        action = actions.draw(act, noise)
         after, reward = advance(env, worlds.state, action, config.action_repeat)
         terminated = after.done > 0
         age, total = worlds.age + config.action_repeat, worlds.total + reward
         ended = terminated | (age >= config.episode_length)
-        logged = log_probability(mean, std, action)
+        logged = actions.log_probability(action)
         transition = Transition(obs, action, logged, reward, packed(after.obs), terminated, ended)
         seen = ended & worlds.counts
         fault = after.metrics.get("fault", jnp.zeros_like(after.done))
@@ -482,16 +514,15 @@ class Batch(NamedTuple):
 
 def loss_of(networks: Networks, batch: Batch, config: PPOConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The clipped objective (Schulman et al. 2017, eq. 9), and what to watch."""
-    mean, std = mean_of(networks, batch.obs), std_of(networks, config)
-    log_ratio = log_probability(mean, std, batch.action) - batch.log_prob
+    actions = actions_of(networks, batch.obs, config)
+    log_ratio = actions.log_probability(batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     gain = jnp.minimum(ratio * advantage, clipped * advantage).mean()
     error = jnp.mean((value_of(networks, batch.obs) - batch.target) ** 2)
-    entropy = jnp.sum(jnp.log(std))
-    watched = {"kl": jnp.mean(ratio - 1 - log_ratio), "value_error": error, "std": std.mean()}
-    return 0.5 * error - gain - config.entropy * entropy, watched
+    watched = {"kl": jnp.mean(ratio - 1 - log_ratio), "value_error": error, "std": actions.std.mean()}
+    return 0.5 * error - gain - config.entropy * actions.entropy(), watched
 
 
 def learn(
@@ -760,6 +791,7 @@ def parser() -> argparse.ArgumentParser:
             nargs="+" if kind is tuple else None,
             type=float if kind is float else _whole,
         )
+    made.set_defaults(switches=1)  # the last number of every kind of action is the gripper's
     return made
 
 

@@ -81,6 +81,16 @@ class PointMass:
         return Point(pos, goal, jnp.concatenate([pos, goal]), reward + there, there, {"success": there})
 
 
+class Latched(PointMass):
+    """Moves only while a switch, the last action, is on the side on which the goal lies."""
+
+    action_size = 3
+
+    def step(self, state: Point, action: jax.Array) -> Point:
+        free = action[2] * (state.goal[0] - state.pos[0]) > 0
+        return super().step(state, jnp.where(free, action[:2], 0.0))
+
+
 class Clock:
     """Episode and reward are ticks: succeeds after the number of ticks drawn at the reset, from 2 to 5."""
 
@@ -128,6 +138,13 @@ def test_ppo_learns_to_go_to_a_place(tmp_path: Path) -> None:
     assert ppo.plot(tmp_path / "curve.png", trained.rows, "point mass") == (tmp_path / "curve.png").is_file()
 
 
+def test_ppo_learns_when_to_turn_a_switch(tmp_path: Path) -> None:
+    config = dataclasses.replace(SMALL, steps=40_000, switches=1)
+    trained = ppo.train(Latched(), config, tmp_path, jit=compiled, report=lambda line: None)
+    assert trained.rows[1]["success"] < 0.5
+    assert trained.success > 0.9
+
+
 def test_images_are_seen_by_policy_and_value_function() -> None:
     rng, env = np.random.default_rng(0), Flags((36, 36, 1), (36, 36, 1))
     networks = ppo.init_networks(jax.random.key(0), env, SMALL)
@@ -147,13 +164,31 @@ def test_images_are_seen_by_policy_and_value_function() -> None:
     assert ppo.Normalizer(jnp.ones(()), jnp.zeros(3), jnp.ones(3))(obs).images is obs.images
 
 
-def test_noise_has_least_deviations_and_the_gripper_its_own() -> None:
-    networks = ppo.init_networks(jax.random.key(0), Flags((36, 36, 1)), SMALL)
-    networks = networks._replace(log_std=jnp.full_like(networks.log_std, -9))
-    config = dataclasses.replace(SMALL, min_std=0.1, min_std_gripper=0.7)
-    std = np.asarray(ppo.std_of(networks, config))
-    np.testing.assert_allclose(std, [0.1] * (len(std) - 1) + [0.7], rtol=1e-6)
-    np.testing.assert_allclose(ppo.std_of(networks, dataclasses.replace(config, min_std_gripper=0.01)), 0.1, rtol=1e-6)
+def test_switches_are_drawn_as_their_probability_says() -> None:
+    logits = jnp.broadcast_to(jnp.asarray([0.0, 2.0, -9.0]), (20_000, 3))
+    actions = ppo.Actions(jnp.zeros((20_000, 2)), jnp.asarray([0.5, 1.0]), logits)
+    drawn = np.asarray(actions.draw(jax.random.key(0), jnp.ones(())))
+    assert set(np.unique(drawn[:, 2:])) == {-1.0, 1.0}
+    np.testing.assert_allclose((drawn[:, 2:] > 0).mean(0), 1 / (1 + np.exp([0, -2, 9])), atol=0.02)
+    np.testing.assert_allclose(drawn[:, :2].std(0), [0.5, 1.0], rtol=0.05)
+    np.testing.assert_array_equal(np.sign(actions.draw(jax.random.key(0), jnp.zeros(())))[0], [0, 0, -1, 1, -1])
+    both = jnp.asarray([[0.0, 0.0, s, t, -1.0] for s in (-1, 1) for t in (-1, 1)])
+    chances = np.exp(actions._replace(mean=jnp.zeros((4, 2)), logits=logits[:4]).log_probability(both))
+    density = 1 / (2 * np.pi * 0.5)  # of the two normal numbers, at their mean
+    assert chances.sum() / density == pytest.approx(1 / (1 + np.exp(-9)), rel=1e-4)
+
+
+def test_a_policy_keeps_trying_both_sides_of_a_switch_and_noise_has_a_least_deviation() -> None:
+    networks = ppo.init_networks(jax.random.key(0), PointMass(), SMALL)
+    *lower, last = networks.policy
+    sure = [*lower, {**last, "bias": jnp.full_like(last["bias"], 100.0)}]
+    networks = networks._replace(policy=sure, log_std=jnp.full_like(networks.log_std, -9))
+    obs = ppo.Obs(jnp.zeros((1, PointMass.observation_size)), None)
+    actions = ppo.actions_of(networks, obs, dataclasses.replace(SMALL, switches=1, min_std=0.1))
+    assert actions.logits.shape == (1, 1)
+    assert 0.98 < jax.nn.sigmoid(actions.logits).item() < 0.99
+    np.testing.assert_allclose(actions.std, 0.1, rtol=1e-6)
+    assert np.sign(ppo.mean_of(networks, obs)).item(-1) == 1
 
 
 @pytest.mark.parametrize(
@@ -268,7 +303,8 @@ def test_log_probabilities_are_those_of_a_normal_distribution() -> None:
     mean, action = jax.random.normal(jax.random.key(0), (2, 6, 3))
     std = jnp.array([0.1, 1.0, 2.5])
     expected = jax.scipy.stats.norm.logpdf(action, mean, std).sum(-1)
-    np.testing.assert_allclose(ppo.log_probability(mean, std, action), expected, rtol=1e-5)
+    actions = ppo.Actions(mean, std, jnp.zeros((*mean.shape[:-1], 0)))
+    np.testing.assert_allclose(actions.log_probability(action), expected, rtol=1e-5)
 
 
 def test_the_normalizer_keeps_mean_and_variance_of_all_it_saw() -> None:

@@ -38,6 +38,8 @@ _GRASP_DEPTH = 0.03
 _GRASP_RADIUS = 0.03
 # What is carried passes this far above what stands around its place, and at least this far above the ground, metres.
 _CLEARANCE, _RAISED = 0.03, 0.05
+# Carrying counts from this horizontal distance on, every centimetre of it the same, metres.
+_CARRY_RANGE = 0.5
 # Within about this horizontal distance a thing counts as above its place, metres.
 _PLACE_RADIUS = 0.06
 
@@ -200,7 +202,7 @@ class Objective:
         ``lift``: 0.3 for nearness to a point at most 3 cm below the target's top, 0.2 for closing the hand there, 0.5
         for the height gained.
         ``goal``: the mean over the goal's predicates: 1 if one holds. Of one that brings an object to a place, while
-        it does not hold: 0.25 for raising the object to 3 cm above what stands around the place (a basket's rim), 0.2
+        it does not hold: 0.2 for raising the object to 3 cm above what stands around the place (a basket's rim), 0.35
         for nearing the place horizontally at that height, 0.1 for lowering it there; and for the first such predicate
         0.1 for the hand's nearness to the object and 0.1 for closing it there, which an object above its place no
         longer needs, and there 0.15 for opening the hand. Of other ones 0.6 for nearness of the thing to its place, of
@@ -246,7 +248,8 @@ class Objective:
         lowered = above * _score(safe_norm(away))
         near, closing = (jnp.maximum(part, above) for part in self._held(view, box))
         opened = above * (1 + view.gripper[0]) / 2
-        carried = 0.25 * high + 0.2 * high * _score(flat) + 0.1 * lowered
+        nearer = jnp.clip(1 - flat / _CARRY_RANGE, 0, 1)
+        carried = 0.2 * high + 0.35 * high * nearer + 0.1 * lowered
         return carried, 0.1 * near + 0.1 * closing + 0.15 * opened
 
     def _holds(self, view: View) -> Bool[Array, " P"]:

@@ -187,6 +187,8 @@ class RayTracer:
                     for name in self._devices or (None,):
                         with wp.ScopedDevice(name) as device:
                             self._prepare(context._contexts[device.ordinal], num_worlds)
+                            # Made on Warp's stream, read on JAX's, which does not wait for it.
+                            wp.synchronize_device(device)
                     self._contexts[num_worlds] = context
             return self._contexts[num_worlds].pytree()
 

@@ -112,6 +112,8 @@ def _noted(callable_: Any, args: Sequence[Any], options: dict[str, Any]) -> list
         arrays = [_argument(arg, value, device) for arg, value in zip(callable_.input_args, args, strict=True)]
         arrays += [_empty(arg, _shape(dims, arg), device) for arg in callable_.output_args]
         callable_.func(*arrays)
+    # What is no launch, such as a new bounding box of a tree, did run, on Warp's stream: JAX's does not wait for it.
+    wp.synchronize_device(device)
     return list({(id(each.module), each.block_dim): each for each in noted}.values())
 
 
