@@ -23,7 +23,7 @@ class NodeSet(ABC):
         parallelism: ``"replicated"``, a simulator keeps a state and each worker of an evaluation needs one of its own;
             or ``"shared"``.
         default_per_step_budget_sec: seconds that one call may take before whoever runs a graph should worry.
-        python_variable: environment variable that names the interpreter for a process of its own; None if it needs none.
+        python_variable: environment variable with the interpreter for a process of its own; None if it needs none.
     """
 
     name: ClassVar[str]
@@ -141,7 +141,7 @@ class EnvNodeSet(NodeSet):
         """
         catalog = self.manager.catalog
         tasks = {head: [choice.value for choice in catalog.tasks(head)] for head in catalog.heads}
-        budgets = {head: self.budgets(head) for head in catalog.heads}
+        budgets = {head: {str(task): most for task, most in self.budgets(head).items()} for head in catalog.heads}
         return {
             "splits": list(catalog.heads),
             "tasks": tasks,
@@ -150,10 +150,8 @@ class EnvNodeSet(NodeSet):
             },
             "fields": list(catalog.fields),
             "metrics": ["success", "num_steps", "cumulative_reward"],
-            "step_budget": max(budget for own in budgets.values() for budget in own.values()),
-            "step_budgets": {
-                head: {str(task): budget for task, budget in own.items()} for head, own in budgets.items()
-            },
+            "step_budget": max(most for own in budgets.values() for most in own.values()),
+            "step_budgets": budgets,
             "default_per_step_budget_sec": self.default_per_step_budget_sec,
             "parallelism": self.parallelism,
         }

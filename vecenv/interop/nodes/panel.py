@@ -2,8 +2,8 @@
 
 A change of a field sets the fields below it to their first values, places the episode, and emits the signal
 ``episode_reset`` with a snapshot of the cascade. ``reset`` puts the same episode back to its start and emits it too.
-``play`` places the selected episode again and asks for the run to start. A response carries one side effect at most, the
-signal or the start of a run; ``pause`` and ``stop`` only change the state.
+``play`` places the selected episode again and asks for the run to start; after ``pause`` it goes on where it was. A
+response carries one side effect at most, the signal or the start of a run; ``pause`` and ``stop`` only change the state.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from pydantic import BaseModel, ConfigDict
 from vecenv.errors import VecenvError
 from vecenv.interop.nodes.catalog import Selection
 from vecenv.interop.nodes.manager import EnvManager
-from vecenv.interop.nodes.ports import NodeError
 from vecenv.interop.nodes.tool import described
 
 ACTIONS = ("play", "pause", "stop", "reset")
@@ -161,17 +160,19 @@ class EnvPanel:
             return self._response(error=error)
         self._state = state
         for listener in self._listeners:
-            listener(EPISODE_RESET, self.values)
+            try:
+                listener(EPISODE_RESET, self.values)
+            except Exception:
+                _log.exception("%s: a listener of the panel failed", self._manager.name)
         return self._response(signal_name=EPISODE_RESET, snapshot=self.values)
 
     def _seat(self, choose: Callable[[], Selection]) -> str:
         """Place an episode; the text of what went wrong."""
         try:
             self._manager.set_episode(choose())
-        except (NodeError, VecenvError) as error:
-            return described(error)
         except Exception as error:
-            _log.warning("%s: an episode cannot be placed", self._manager.name, exc_info=True)
+            if not isinstance(error, VecenvError):
+                _log.warning("%s: an episode cannot be placed", self._manager.name, exc_info=True)
             return described(error)
         return ""
 
