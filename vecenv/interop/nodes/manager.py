@@ -151,7 +151,7 @@ class EnvManager:
         return self.worker.call(lambda: self._place(selection))
 
     def ensure_live(self) -> EpisodeInfo:
-        """The live episode as it is; a finished one is put back to its start; if there is none, the selected is placed."""
+        """The live episode as it is; a finished one begins again; before the first, the selected one is placed."""
 
         def job() -> EpisodeInfo:
             if self._episode is None:

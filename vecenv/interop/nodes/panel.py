@@ -3,7 +3,7 @@
 A change of a field sets the fields below it to their first values, places the episode, and emits the signal
 ``episode_reset`` with a snapshot of the cascade. ``reset`` puts the same episode back to its start and emits it too.
 ``play`` places the selected episode again and asks for the run to start; after ``pause`` it goes on where it was. A
-response carries one side effect at most, the signal or the start of a run; ``pause`` and ``stop`` only change the state.
+response carries at most one side effect, the signal or the start of a run; ``pause`` and ``stop`` change the state.
 """
 
 from __future__ import annotations
