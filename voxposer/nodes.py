@@ -3,7 +3,8 @@
 An episode's language programs and what they know stay in this process, behind the text ``runtime_handle`` that
 ``voxposer__init`` returns. Everything else on the wires is plain: a snapshot as ``observe_objects`` returns it,
 subtasks as texts, waypoints as lists of mappings, actions as JSON. Planning reads the snapshot that it is given and
-nothing else; no tool here touches an environment. The dispenser's cursor and the carried grip belong to a node of a graph.
+nothing else; no tool here touches an environment. The dispenser's cursor and the carried grip belong to a node of a
+graph.
 """
 
 from __future__ import annotations
@@ -186,7 +187,7 @@ class PlanSubtask(VoxPoserTool):
 
 
 class ExpandConfig(ToolConfig):
-    """``settle_steps``: ticks of a hold. ``settle``: repeats of a motion's end. ``max_waypoints``: kept ones, None: all."""
+    """``settle_steps``: ticks of a hold; ``settle``: repeats of a motion's end; ``max_waypoints``: None keeps all."""
 
     settle_steps: int = Field(default=HOLD_TICKS, ge=1, le=10_000)
     settle: int = Field(default=PlanConfig().settle, ge=0, le=1000)
