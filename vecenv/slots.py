@@ -227,6 +227,11 @@ class SlotBatch(ABC):
         self._live |= stale
         self._quarantine(stale)
 
+    def tool_poses(self) -> np.ndarray:
+        """Poses of the end effectors, xyz (metres) and wxyz, world frame, [B, 7], a copy."""
+        self._check_live()
+        return self._tools()
+
     def end_episodes(self, slots: Any) -> None:
         """End the episodes of some slots: truncated, they ignore further steps and cost nothing until ``reset``.
 

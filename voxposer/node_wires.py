@@ -112,7 +112,7 @@ def identity_of(value: object) -> str:
     """What tells a list of waypoints from others: the name of its plan, or what is in it."""
     rows = _rows(value)
     if rows and isinstance(rows[0], Mapping) and isinstance(rows[0].get("plan"), str):
-        return rows[0]["plan"]
+        return rows[0]["plan"].encode(errors="replace").decode()
     return hashlib.sha256(json.dumps(rows, default=_plain).encode()).hexdigest()
 
 

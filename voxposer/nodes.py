@@ -166,7 +166,7 @@ class PlanSubtask(VoxPoserTool):
         """A trajectory; none after an error, and then no subtask is left either."""
         handle = given["runtime_handle"]
         runtimes = self.manager.runtimes(handle)
-        index = whole_number("subtask_index", given["subtask_index"])
+        index = whole_number("input 'subtask_index'", given["subtask_index"])
         snapshot = snapshot_from_dict(given["snapshot"])
         if given["last_gripper"] is not None:
             runtimes.set_gripper([handle], grip_of(given["last_gripper"], "last_gripper"))
@@ -385,7 +385,7 @@ class CheckDone(VoxPoserTool):
     def work(self, given: Mapping[str, Any], config: Any, node: str) -> dict[str, Any]:
         """Done or not."""
         names = ("subtask_index", "subtask_count", "step_index", "max_steps")
-        index, count, step, budget = (whole_number(name, given[name]) for name in names)
+        index, count, step, budget = (whole_number(f"input {name!r}", given[name]) for name in names)
         ended = check_done(index, count, given["episode_success"], step, budget)
         return {"done": bool(ended.done[0]), "reason": ended.reason[0]}
 

@@ -222,6 +222,7 @@ def test_no_tool_raises_whatever_it_is_given(libero: EnvLiberoNodeSet, inputs: A
         ({"action": "[]"}, {"tol": 1}, "config.tol does not exist; options: max_steps, pos_tol_m, rot_tol_rad"),
         ({"action": "[]"}, [1], "config: got a list; expected a mapping from options to values"),
         ("[]", {}, "inputs: got a str; expected a mapping from ports to values"),
+        ({"action": "[\ud800]"}, {}, "input 'action': the text holds half a surrogate pair"),
         ({"action": "x" * 1_000_001}, {}, "input 'action': 1,000,001 characters; at most 1,000,000 are read"),
     ],
 )

@@ -280,3 +280,22 @@ def test_simplers_environments_stay_open_when_the_split_changes(simpler: EnvSimp
     assert changed.step_budget == 80
     assert simpler.panel.set_field("split", "bridge").error == ""
     assert simpler.manager.run(lambda env, _: env) is bridge
+
+
+def test_simplers_tool_is_driven_to_poses_within_the_limits_of_a_call(simpler: EnvSimplerNodeSet) -> None:
+    call = Caller(simpler)
+    call("reset")
+    there = [*(call("step_ee_pose", "[]")["final_pose"] + [0.05, 0, 0.03, 0, 0, 0, 0]), 1.0]
+    assert call("step_ee_pose", there, max_steps=1)["step_count"] == 1
+    moved = call("step_ee_pose", there)
+    assert moved["converged"]
+    assert np.linalg.norm(moved["final_pose"][:3] - there[:3]) < 0.01
+    assert call("step_ee_pose", {"pose": there, "hold_steps": 4})["step_count"] == 4
+
+
+def test_the_step_budget_is_the_protocols() -> None:
+    nodes = EnvLiberoNodeSet((SUITE,))
+    nodes.initialize(protocol="openpi")
+    expected = vecenv.eval_metadata(SUITE, "openpi")["max_steps"]
+    assert nodes.panel.step_budget == nodes.get_eval_metadata()["step_budget"] == expected < 2500
+    nodes.shutdown()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from pydantic import Field
@@ -38,6 +38,8 @@ from vecenv.interop.nodes.verbs import (
     motion_outputs,
     step_pose,
 )
+from vecenv.protocols import DEFAULT
+from vecenv.slots import SlotBatch
 
 NAME = "env_libero"
 # Ticks that fingers get to close.
@@ -185,15 +187,15 @@ class CloseGripper(StepTool):
         """One hold, which takes control ticks of the episode."""
 
         def job(env: BatchEnv, episode: EpisodeInfo) -> dict[str, Any]:
-            pose = np.append(env.step_ee_pose(()).final_pose[0], 1.0)
+            pose = np.append(cast(SlotBatch, env).tool_poses()[0], 1.0)
             return motion_outputs(step_pose(self.manager, env, EePoseText(pose, config.hold_steps), EePoseConfig()))
 
         return self.manager.run(job)
 
 
 @lru_cache
-def _budget(suite: str) -> int:
-    return vecenv.eval_metadata(suite)["max_steps"]
+def _budget(suite: str, protocol: str) -> int:
+    return vecenv.eval_metadata(suite, protocol)["max_steps"]
 
 
 class EnvLiberoNodeSet(EnvNodeSet):
@@ -228,6 +230,7 @@ class EnvLiberoNodeSet(EnvNodeSet):
         return [kind(self.manager) for kind in kinds]
 
     def budgets(self, head: str) -> dict[str | int, int]:
-        """The same for all tasks, unless ``initialize`` was given another."""
-        given = self.manager.options.get("max_steps")
-        return {choice.value: given or _budget(head) for choice in self.manager.catalog.tasks(head)}
+        """The same for all tasks: what ``initialize`` was given, or the protocol's."""
+        options = self.manager.options
+        most = options.get("max_steps") or _budget(head, options.get("protocol", DEFAULT))
+        return {choice.value: most for choice in self.manager.catalog.tasks(head)}

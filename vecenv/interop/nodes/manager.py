@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from vecenv.contract import BatchEnv, Control, ResetInfo
 from vecenv.interop.nodes.catalog import Catalog, Selection
 from vecenv.interop.nodes.ports import NodeError
 from vecenv.interop.nodes.worker import Worker
+from vecenv.slots import SlotBatch
 
 _Result = TypeVar("_Result")
 
@@ -213,10 +214,8 @@ class EnvManager:
 
     def _begin(self, env: BatchEnv, selection: Selection) -> EpisodeInfo:
         info: ResetInfo = env.reset()
-        # An empty action moves nothing and says where the hand is.
-        hand = env.step_ee_pose(())
-        self.closed_grip, self._flags = False, Flags.of(hand)
-        self._episode = EpisodeInfo(
-            selection, info.instruction[0], int(info.max_steps[0]), np.array(hand.final_pose[0], float)
-        )
+        home = cast(SlotBatch, env).tool_poses()[0]
+        # Physics that fails at the start ends the episode before its first tick.
+        self.closed_grip, self._flags = False, Flags(truncated=bool(env.done[0]))
+        self._episode = EpisodeInfo(selection, info.instruction[0], int(info.max_steps[0]), home)
         return self._episode

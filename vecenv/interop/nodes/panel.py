@@ -107,12 +107,13 @@ class EnvPanel:
     def fields(self) -> list[Field]:
         """The fields from the top of the cascade to its end."""
         selection = self._manager.selection
+        values = self._catalog.snapshot(selection)
         default = self._catalog.beginning(selection.head)
         tops = (self._catalog.first().head, default.task, default.episode)
         return [
             Field(
                 name=name,
-                value=self.values[name],
+                value=values[name],
                 default=tops[level],
                 options=[Option(value=value, label=label) for value, label in self._catalog.choices(level, selection)],
             )

@@ -17,6 +17,8 @@ from vecenv.errors import InvalidInput
 
 # Longest text that a port takes, characters.
 LONGEST_TEXT = 1_000_000
+# Largest whole number that every JSON reader keeps exact.
+_LARGEST = 2**53
 
 
 class NodeError(InvalidInput):
@@ -105,21 +107,32 @@ def _value(port: Port, value: Any) -> Any:
 def _text(name: str, value: Any) -> str:
     if not isinstance(value, str):
         raise NodeError(f"input {name!r}: got {_kind(value)}; expected text")
+    if not _is_unicode(value):
+        raise NodeError(f"input {name!r}: the text holds half a surrogate pair, which is no character")
     if len(value) > LONGEST_TEXT:
         raise NodeError(f"input {name!r}: {len(value):,} characters; at most {LONGEST_TEXT:,} are read")
     return value
 
 
-def whole_number(name: str, value: Any, least: int = 0) -> int:
-    """A whole number that came over a wire.
+def _is_unicode(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def whole_number(what: str, value: Any, least: int = 0) -> int:
+    """A whole number that came over a wire; ``what`` begins the sentence of the error.
 
     Raises:
-        NodeError: something else, or less than ``least``.
+        NodeError: something else, less than ``least``, or more than 2^53.
     """
     if isinstance(value, np.generic | np.ndarray) and np.ndim(value) == 0:
         value = value.item()
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != value // 1 or value < least:
-        raise NodeError(f"input {name!r}: got {_shown(value)}; expected a whole number from {least} on")
+    number = not isinstance(value, bool) and isinstance(value, int | float)
+    if not number or not least <= value <= _LARGEST or value != int(value):
+        raise NodeError(f"{what}: got {_shown(value)}; expected a whole number from {least} on")
     return int(value)
 
 

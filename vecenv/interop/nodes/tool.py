@@ -158,6 +158,7 @@ class Memories(Generic[_State]):
 def described(error: BaseException) -> str:
     """An error as one text: its message, and the kind of one that was not raised on purpose."""
     text = str(error) if isinstance(error, VecenvError) else f"{type(error).__name__}: {error}"
+    text = text.encode(errors="replace").decode()  # a server could not send half a surrogate pair
     return text if len(text) <= _LONGEST_ERROR else f"{text[:_LONGEST_ERROR]} ..."
 
 
