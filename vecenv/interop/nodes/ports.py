@@ -130,8 +130,9 @@ def whole_number(what: str, value: Any, least: int = 0) -> int:
     """
     if isinstance(value, np.generic | np.ndarray) and np.ndim(value) == 0:
         value = value.item()
-    number = not isinstance(value, bool) and isinstance(value, int | float)
-    if not number or not least <= value <= _LARGEST or value != int(value):
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise NodeError(f"{what}: got {_kind(value)}; expected a whole number from {least} on")
+    if not least <= value <= _LARGEST or value != int(value):
         raise NodeError(f"{what}: got {_shown(value)}; expected a whole number from {least} on")
     return int(value)
 
