@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from vecenv.interop.nodes import snapshot_from_dict
+from vecenv.interop.nodes import NodeError, snapshot_from_dict
 from vecenv.interop.nodes.worker import Worker
 from voxposer.language.llm import Llm
 from voxposer.runtime import HandleError, Runtimes
@@ -24,6 +24,16 @@ NAME = "voxposer"
 MOST_EPISODES = 64
 # Configurations that are kept although no episode is open.
 _MOST_CONFIGS = 8
+# Options of the batched agent that a graph decides itself, and where.
+_DECIDED_BY_GRAPHS = {
+    **dict.fromkeys(("max_subtasks", "passes", "wait", "idle_ticks"), "the graph's outer loop decides it"),
+    "max_waypoints": "it is an option of voxposer__expand_for_settle",
+    "plan": "voxposer__expand_for_settle has such options",
+    "max_misses": "it is an option of voxposer__dispense_waypoint",
+    "follow": "a graph follows one waypoint a call",
+    "perception.source": "tools plan on the snapshot that is wired",
+    "perception.camera": "tools plan on the snapshot that is wired",
+}
 
 
 @dataclass
@@ -63,7 +73,7 @@ class RuntimeManager:
         Raises:
             InvalidInput: there is no such option, or a value cannot be used.
         """
-        Settings.of(options)
+        _settings(options)
         self.worker.open()
         self._usual = dict(options)
 
@@ -102,7 +112,7 @@ class RuntimeManager:
         """The episodes of one configuration; a model that no open episode uses is closed before long."""
         key = json.dumps(options, sort_keys=True, default=repr)
         if key not in self._opened:
-            settings = Settings.of(options)
+            settings = _settings(options)
             llm = settings.open_llm()
             runtimes = Runtimes(llm, settings.agent_config(), prompts_dir=settings.prompts_dir)
             self._opened[key] = _Open(runtimes, llm)
@@ -117,3 +127,17 @@ class RuntimeManager:
             opened.runtimes.release([handle])
         self._handles.clear()
         self._opened.clear()
+
+
+def _settings(options: Mapping[str, Any]) -> Settings:
+    """Settings of options, without those that would have no effect.
+
+    Raises:
+        InvalidInput: there is no such option, a value cannot be used, or a graph decides it itself.
+    """
+    settings = Settings.of(options)
+    for name, instead in _DECIDED_BY_GRAPHS.items():
+        above, _, last = name.rpartition(".")
+        if last in (settings.agent.get(above, {}) if above else settings.agent):
+            raise NodeError(f"option {name} has no effect here: {instead}")
+    return settings

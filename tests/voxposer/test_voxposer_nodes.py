@@ -170,6 +170,8 @@ def test_options_reach_the_planner_and_graphs_cannot_name_files_or_addresses(nod
         assert refused["runtime_handle"] == ""
     assert "no option 'planer'" in call("init", {"options": {"planer": 1}}, snapshot=CUBE)["error"]
     assert "api_key is not taken" in call("init", {"options": {"api_key": "x"}}, snapshot=CUBE)["error"]
+    for name, value in (("passes", 2), ("plan.settle", 3), ("perception", "camera"), ("max_misses", 1)):
+        assert "has no effect here" in call("init", {"options": {name: value}}, snapshot=CUBE)["error"]
     with pytest.raises(InvalidInput, match="no option 'nothing'"):
         nodes.initialize(nothing=1)
     nodes.initialize(num_waypoints_per_plan=7)
