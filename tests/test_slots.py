@@ -237,3 +237,9 @@ def test_images_answer_to_liberos_names_and_list_the_cameras_otherwise() -> None
     assert images.get("front") is None
     with pytest.raises(KeyError, match="no camera 'front'; cameras: agentview, wrist"):
         images["front"]
+
+
+def test_an_environment_without_limits_of_waypoints_says_so() -> None:
+    batch = Scripted(1)
+    with pytest.raises(Refused, match="cannot change pos_tol"), batch.waypoint_limits(pos_tol=0.1):
+        pass

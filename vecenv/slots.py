@@ -227,6 +227,11 @@ class SlotBatch(ABC):
         self._live |= stale
         self._quarantine(stale)
 
+    def tool_poses(self) -> np.ndarray:
+        """Poses of the end effectors, xyz (metres) and wxyz, world frame, [B, 7], a copy."""
+        self._check_live()
+        return self._tools()
+
     def end_episodes(self, slots: Any) -> None:
         """End the episodes of some slots: truncated, they ignore further steps and cost nothing until ``reset``.
 
@@ -342,6 +347,28 @@ class SlotBatch(ABC):
             final_pose=self._tools(),
             error=errors,
         )
+
+    @contextmanager
+    def waypoint_limits(
+        self, *, max_steps: int | None = None, pos_tol: float | None = None, rot_tol: float | None = None
+    ) -> Iterator[None]:
+        """While inside, ``step_ee_pose`` and ``step_waypoints`` have other limits; None keeps the configured one.
+
+        Args:
+            max_steps: control ticks a waypoint may take.
+            pos_tol: metres within which it is reached.
+            rot_tol: radians within which it is reached.
+        """
+        given = {"max_steps": max_steps, "pos_tol": pos_tol, "rot_tol": rot_tol}
+        before = self._limit_waypoints({name: value for name, value in given.items() if value is not None})
+        try:
+            yield
+        finally:
+            self._limit_waypoints(before)
+
+    def _limit_waypoints(self, changes: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Change fields of the follower's config; returns what they were."""
+        raise self._error(f"this environment cannot change {', '.join(changes)}")
 
     @contextmanager
     def watched(self, watcher: Watcher) -> Iterator[None]:

@@ -26,7 +26,7 @@ from vecenv.libero.physics.base import SETTLE_ACTION, Group, Physics, Start
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.physics.build import make_physics
 from vecenv.libero.render.cameras import CameraRig, options_of
-from vecenv.libero.render.options import VisualOptions
+from vecenv.libero.render.options import RenderConfig, VisualOptions
 from vecenv.libero.render.sources import visual_source
 from vecenv.libero.scene import goals
 from vecenv.libero.scene.bddl import Problem, SceneKey
@@ -79,7 +79,9 @@ class LiberoEnv(SlotBatch):
         self._sources = tasks
         self._physics: Physics | None = None
         self._on_device = config.arrays == "jax"
-        self._cameras = CameraRig(self._rules.render, self.num_envs, config.cameras, visual_source(config.scenes))
+        self._cameras = self._rig(self._rules.render)
+        # Another one for images of another size, made when they are first asked for.
+        self._resized: CameraRig | None = None
         self._place(placement)
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
@@ -190,6 +192,8 @@ class LiberoEnv(SlotBatch):
         """Release physics and renderer; the environment cannot be used afterwards. Closing twice is harmless."""
         self._close_physics()
         self._cameras.close()
+        if self._resized is not None:
+            self._resized.close()
         self._closed = True
 
     def _close_physics(self) -> None:
@@ -221,7 +225,7 @@ class LiberoEnv(SlotBatch):
         return self._control(Control, self._book(ran.ticks, ran.success, ran.solved), before, sanitized)
 
     def _images_s(self) -> float:
-        return self._cameras.seconds
+        return self._cameras.seconds + (0.0 if self._resized is None else self._resized.seconds)
 
     @property
     def _ticks_left(self) -> np.ndarray:
@@ -256,16 +260,25 @@ class LiberoEnv(SlotBatch):
         reward = self._book(followed.ticks, followed.success, followed.solved)
         return reward, followed.converged, followed.waypoint_ticks
 
+    def _limit_waypoints(self, changes: Mapping[str, Any]) -> Mapping[str, Any]:
+        before = self.config.waypoint
+        self.config = replace(self.config, waypoint=replace(before, **changes))
+        return {name: getattr(before, name) for name in changes}
+
     def _tools(self) -> np.ndarray:
         return np.concatenate(self.physics.eef(), axis=1)
 
     # -- perception ----------------------------------------------------------------------------------------------------
 
-    def observe_egocentric(self, slots: npt.ArrayLike | None = None) -> Egocentric:
+    def observe_egocentric(
+        self, slots: npt.ArrayLike | None = None, image_size: tuple[int, int] | None = None
+    ) -> Egocentric:
         """Proprioception of every slot, and what its cameras see now; images are rendered when they are read.
 
         Args:
             slots: draw the images of these slots only, bool [B] or indices; those of the others are black. None: all.
+            image_size: height and width in pixels, None for those of ``config.render``. Such images must be read before
+                others of yet another size are asked for.
 
         Reading one raises ``GlError`` where there is no GL, ``SceneError`` or ``AssetsMissing`` where the meshes and
         textures are missing, and ``ExportError`` where ``config.scenes`` was exported without such images.
@@ -273,7 +286,7 @@ class LiberoEnv(SlotBatch):
         self._check_live()
         groups = self.physics.groups
         problems = [self._tasks[int(self._placement.task[group.slots[0]])].problem for group in groups]
-        seen = self._cameras.capture(groups, problems, self.slot_indices(slots))
+        seen = self._sized(image_size).capture(groups, problems, self.slot_indices(slots))
         in_jax = self._on_device and self._rules.render.engine == "raytrace"
         return self._delivered(
             Egocentric(
@@ -288,6 +301,23 @@ class LiberoEnv(SlotBatch):
                 instances=seen.instances,
             )
         )
+
+    def _rig(self, render: RenderConfig) -> CameraRig:
+        return CameraRig(render, self.num_envs, self.config.cameras, visual_source(self.config.scenes))
+
+    def _sized(self, image_size: tuple[int, int] | None) -> CameraRig:
+        """The cameras that make images of a size; one more size than the configured is kept ready."""
+        height, width = image_size or (self._rules.render.height, self._rules.render.width)
+        wanted = replace(self._rules.render, height=height, width=width)
+        if wanted == self._cameras.config:
+            return self._cameras
+        if self._resized is None or self._resized.config != wanted:
+            if self._resized is not None:
+                self._resized.close()
+                self._cameras.seconds += self._resized.seconds
+            self._resized = self._rig(wanted)
+        self._resized.options = self._cameras.options
+        return self._resized
 
     def set_visuals(self, options: VisualOptions | Sequence[VisualOptions]) -> None:
         """Change the appearance of slots from the next observation on: light, viewpoints, colours, textures.

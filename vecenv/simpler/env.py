@@ -15,6 +15,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -252,6 +253,11 @@ class SimplerEnv(SlotBatch):
             stuck = servo.stuck(targets, self._facts["tcp"], driving & going)
             going = going & ~self.done & (used < ticks) & ~(driving & arrived) & ~stuck
         return reward, arrived
+
+    def _limit_waypoints(self, changes: Mapping[str, Any]) -> Mapping[str, Any]:
+        before = self._servo.config
+        self._servo.config = replace(before, **changes)
+        return {name: getattr(before, name) for name in changes}
 
     def _follow(self, plan: WaypointPlan, max_misses: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         follower = PlanFollower(self._servo, plan, max_misses)
