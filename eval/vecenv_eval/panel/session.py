@@ -150,8 +150,9 @@ class Session:
     def state(self, slot: int = 0) -> SessionState:
         """The session as it is now; ``planning`` is of ``slot``."""
         with self._cond:
-            batch, config = self._batch, self._config
-            slots = self._monitor.slots()
+            building = self._name == "building"
+            batch, config = None if building else self._batch, self._config
+            slots = () if building else self._monitor.slots()
             planned, finished, successes, errors = self._counts
             return SessionState(
                 state=self._name,
@@ -173,6 +174,7 @@ class Session:
                 planning=batch.plans.of(slot, self._monitor.instruction(slot)) if batch and slots else None,
                 cameras=self.frames.cameras,
                 image_size=self.frames.image_size,
+                preparing_images=self.frames.preparing,
                 results=batch.results if batch else None,
                 revision=sum(self.version),
             )
@@ -200,6 +202,7 @@ class Session:
         with self._cond:
             self._check_open()
             self._order, self._playing, self._budget = config, False, 0
+            self._config, self._counts = config, (0, 0, 0, 0)
             self._select(config)
             self._set("building", None)
 
@@ -214,7 +217,8 @@ class Session:
             SessionError: there is no such field, suite, task or episode, or no suite was chosen yet.
         """
         fields = self._chosen({"split": "suite", "task_id": "task", "episode_index": "episode"}.get(name, name), value)
-        assert fields.suite is not None and fields.task is not None
+        assert fields.suite is not None
+        assert fields.task is not None
         index = catalog.task_index(fields.suite, fields.task)
         self.build(self.config_of(fields.suite, tasks=str(index), episodes=f"{fields.episode}-{fields.episode}"))
         return fields
@@ -432,7 +436,6 @@ class Session:
     def _build(self, config: EvalConfig) -> None:
         self._drop_batch()
         with self._cond:
-            self._config = config
             self._set("building", None)
         limit = config.num_envs or self._max_slots
         self._batch = LiveBatch(replace(config, num_envs=limit), self._simulator)

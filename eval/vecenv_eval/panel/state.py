@@ -70,7 +70,7 @@ class SlotState:
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint:
-    """A stop of the hand: position, metres, and rotation, wxyz, in the world frame; whether the grip is closed there."""
+    """A stop of the hand: position (metres) and rotation (wxyz) in the world frame; whether the grip is closed there."""
 
     pos: tuple[float, float, float]
     quat: tuple[float, float, float, float]
@@ -139,6 +139,7 @@ class SessionState:
         planning: of the slot that is looked at; None where the policy plans nothing.
         cameras: names of the cameras that can be watched; empty where nothing is drawn.
         image_size: height and width of their images, pixels; None before the first was drawn.
+        preparing_images: the first image of a scene is being drawn: nothing else happens for some seconds.
         results: name of the results folder that the run is written to; None without one.
         revision: larger whenever something in the scene or here has changed.
     """
@@ -165,6 +166,7 @@ class SessionState:
     planning: Planning | None = None
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] | None = None
+    preparing_images: bool = False
     results: str | None = None
     revision: int = 0
 
