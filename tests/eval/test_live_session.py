@@ -13,7 +13,7 @@ import pytest
 from support.live_world import LiveWorld, config, session
 from vecenv_eval.panel.frames import WALL, View
 from vecenv_eval.panel.session import Session
-from vecenv_eval.panel.state import SessionClosed, SessionError
+from vecenv_eval.panel.state import SessionClosed, SessionError, UnknownSlot
 from vecenv_eval.store import ResultStore
 
 import vecenv
@@ -149,7 +149,7 @@ def test_history_has_a_row_a_tick_and_begins_anew_with_the_episode() -> None:
         assert history.episode_id == "fake_suite/0/1"
         assert history.step == (0, 1)
         assert history.action == ((0.0,) * 6 + (-1.0,),) * 2
-        with pytest.raises(SessionError, match="no slot 3"):
+        with pytest.raises(UnknownSlot, match="no slot 3"):
             live.history(3)
 
 

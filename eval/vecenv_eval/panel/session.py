@@ -38,7 +38,16 @@ from vecenv_eval.panel import catalog
 from vecenv_eval.panel.batch import LiveBatch
 from vecenv_eval.panel.frames import FrameHub
 from vecenv_eval.panel.monitor import Monitor
-from vecenv_eval.panel.state import Fields, History, SessionClosed, SessionError, SessionState, StateName
+from vecenv_eval.panel.state import (
+    Fields,
+    History,
+    OutOfTurn,
+    SessionClosed,
+    SessionError,
+    SessionState,
+    StateName,
+    UnknownSlot,
+)
 from vecenv_eval.policies import raised
 from vecenv_eval.results import Progress
 from vecenv_eval.runner import check
@@ -183,11 +192,11 @@ class Session:
         """The columns of the episode that a slot runs, or ran last.
 
         Raises:
-            SessionError: there is no such slot.
+            UnknownSlot: there is no such slot.
         """
         found = self._monitor.history(slot)
         if found is None:
-            raise SessionError(f"there is no slot {slot} in this session")
+            raise UnknownSlot(f"there is no slot {slot} in this session")
         return found
 
     def build(self, config: EvalConfig) -> None:
@@ -258,14 +267,14 @@ class Session:
             ``"run_start"`` if a run began, ``"episode_reset"`` if the episodes were put back to their start.
 
         Raises:
-            SessionError: nothing is built.
+            OutOfTurn: nothing is built.
             SessionClosed: the session was closed.
         """
         with self._cond:
             self._check_open()
             if self._name not in _BUILT:
                 why = {"building": "it is being built", "error": f"it failed: {self._error}"}.get(self._name)
-                raise SessionError(f"the session cannot {action}: {why or 'nothing is built yet'}")
+                raise OutOfTurn(f"the session cannot {action}: {why or 'nothing is built yet'}")
             begins = self._name in ("ready", "finished") and action in ("play", "step")
             if action == "play":
                 self._playing, self._budget = True, 0
@@ -379,7 +388,7 @@ class Session:
         if field not in ("task", "episode"):
             raise SessionError(f"there is no field {field!r}: suite, task or episode")
         if now.suite is None:
-            raise SessionError("choose a suite first")
+            raise OutOfTurn("choose a suite first")
         rows = catalog.tasks(now.suite)
         if field == "task":
             return Fields(suite=now.suite, task=rows[catalog.task_index(now.suite, value)].task, episode=0)

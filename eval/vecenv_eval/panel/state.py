@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vecenv.errors import InvalidInput, SimulationError
+from vecenv.errors import InvalidInput, NotFound, SimulationError
 
 # "idle": nothing was built. "building": an environment and a policy are made, or episodes are placed. "ready": episodes
 # are at their start. "playing", "paused": a run goes on, or waits. "finished": it has ended or was stopped. "error":
@@ -19,7 +19,15 @@ Verdict = Literal["live", "success", "failure", "fault"]
 
 
 class SessionError(InvalidInput):
-    """A live session cannot do what was asked in its present state; the message says why."""
+    """A live session was asked for something that does not exist or that it cannot do; the message says why."""
+
+
+class OutOfTurn(SessionError):
+    """It cannot do that in its present state."""
+
+
+class UnknownSlot(NotFound):
+    """There is no such slot."""
 
 
 class SessionClosed(SimulationError):
