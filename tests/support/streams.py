@@ -15,7 +15,12 @@ from websockets.sync.client import ClientConnection, connect
 
 def opened(server: Server, headers: Mapping[str, str] | None = None) -> ClientConnection:
     """A connection to the stream."""
-    url = f"{server.url.replace('http', 'ws', 1)}/api/stream"
+    return opened_at(server.url, headers)
+
+
+def opened_at(address: str, headers: Mapping[str, str] | None = None) -> ClientConnection:
+    """A connection to the stream of the server at an address."""
+    url = f"{address.replace('http', 'ws', 1)}/api/stream"
     return connect(url, additional_headers=dict(headers or {}), max_size=None, compression=None, close_timeout=1)
 
 
