@@ -158,8 +158,29 @@ async def measure(
 
 def start(folder: Path) -> tuple[subprocess.Popen[str], str]:
     """The server, ready and playing."""
-    command = [sys.executable, "-m", "vecenv_eval.web", "--no-open", "--port", "0", "--play", "--out", str(folder)]
-    what = ["--suite", "libero_object", "--episodes", str(SLOTS), "--policy", "random", "--max-steps", "1000000"]
+    command = [
+        sys.executable,
+        "-m",
+        "vecenv_eval.cli.serve",
+        "--no-open",
+        "--port",
+        "0",
+        "--play",
+        "--out",
+        str(folder),
+    ]
+    what = [
+        "--suite",
+        "libero_object",
+        "--episodes",
+        str(SLOTS),
+        "--policy",
+        "random",
+        "--max-steps",
+        "1000000",
+        "--num-threads",
+        "1",
+    ]
     paths = os.pathsep.join(str(ROOT / each) for each in (".", "eval"))
     process = subprocess.Popen(
         [*command, *what], stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths}
