@@ -194,7 +194,7 @@ class Monitor:
                 return None
             rows = self._rows[slot][: self._count[slot]].copy()
             episode = self._id(slot)
-        known: np.ndarray = np.isfinite(rows).all(axis=0)
+        known = np.atleast_1d(np.isfinite(rows).all(axis=0))
         rounded = np.round(rows.astype(float), _DECIMALS)
         return History(
             slot=slot,
