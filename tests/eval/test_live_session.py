@@ -327,6 +327,20 @@ def test_the_wall_is_one_image_with_a_tile_a_slot() -> None:
     assert np.abs(middles[:, 0] - [40, 60, 80, 100, 120, 140]).max() < 10
 
 
+def test_a_slot_that_is_shown_and_on_the_wall_is_drawn_once() -> None:
+    world = LiveWorld()
+    with session(world, config=config(tasks="1", episodes="3", max_steps=1000)) as live:
+        live.wait_until("ready", timeout=20)
+        hold = threading.Event()
+        held = live.call(lambda env: hold.wait(10))  # both are asked for before any is drawn
+        live.frames.want(View(1, "agentview", 64))
+        live.frames.want(WALL)
+        hold.set()
+        assert held.result(10)
+        until(lambda: live.frames.newest(WALL) and live.frames.newest(View(1, "agentview", 64)))
+    assert sorted(world.last.drawn) == [(slot, "agentview") for slot in range(3)]
+
+
 def test_images_that_cannot_be_drawn_end_no_run() -> None:
     world = LiveWorld()
     with session(world) as live:
