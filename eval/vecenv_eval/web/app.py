@@ -38,6 +38,8 @@ from vecenv_eval.web.settings import ServeSettings
 
 STATIC = Path(__file__).parent / "static"
 # Pages of the package by address.
+# Statuses that any route may answer.
+_REFUSALS = (400, 401, 403, 404, 405, 408, 413, 421, 422, 429, 503)
 _PAGES = {"/": "index.html", "/view": "view.html"}
 
 
@@ -72,7 +74,7 @@ def create_app(
         docs_url=None,  # they load scripts from elsewhere
         redoc_url=None,
         lifespan=lifespan,
-        responses={code: {"model": ErrorBody} for code in (400, 401, 403, 404, 405, 408, 413, 421, 422, 429, 503)},
+        responses={code: {"model": ErrorBody} for code in _REFUSALS},
     )
     app.state.context = context
     install_handlers(app)
@@ -82,21 +84,26 @@ def create_app(
         """The server runs."""
         return Health(version=vecenv.__version__)
 
-    for router in (login_router(context), catalog_router(settings), *routers):
+    for router in (login_router(context), catalog_router(settings), *_session_routers(context), *routers):
         app.include_router(router)
-    if session is not None:
-        app.include_router(panel_router(context, session))
-        app.include_router(frames_router(context, session))
-    if settings.nodes and session is not None:
-        from vecenv_eval.web.routes_nodes import nodes_router
-
-        app.include_router(nodes_router(context))
     _add_pages(app, static)
     app.add_middleware(Limits, settings=settings)
     app.add_middleware(Guard, settings=settings, tokens=context.tokens, failures=context.failures)
     app.add_middleware(Headers)
     app.add_middleware(AccessLog)
     return app
+
+
+def _session_routers(context: Context) -> list[APIRouter]:
+    """The routes of a session and of the nodes; none without a session."""
+    if context.session is None:
+        return []
+    routers = [panel_router(context, context.session), frames_router(context, context.session)]
+    if context.settings.nodes:
+        from vecenv_eval.web.routes_nodes import nodes_router
+
+        routers.append(nodes_router(context))
+    return routers
 
 
 def _add_pages(app: FastAPI, static: Path) -> None:

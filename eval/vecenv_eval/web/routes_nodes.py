@@ -134,6 +134,11 @@ def nodes_router(context: Context, host: NodeHost | None = None) -> APIRouter:
         outputs = await nodes.call(name, lambda: plain(tool.run(body.inputs, body.config, node=body.node)))
         return NodeAnswer(outputs=outputs)
 
+    _add_panels(router, context, nodes)
+    return router
+
+
+def _add_panels(router: APIRouter, context: Context, nodes: NodeHost) -> None:
     def panel_of(node_set: str) -> Any:
         panel = nodes.sets[node_set].panel if node_set in nodes.sets else None
         if panel is None:
@@ -159,8 +164,6 @@ def nodes_router(context: Context, host: NodeHost | None = None) -> APIRouter:
         panel = panel_of(node_set)
         context.writers.claim(f"nodes/{node_set}", writer)
         return _answer(await nodes.call(node_set, panel.action, body.action))
-
-    return router
 
 
 def _described(tool: Any) -> dict[str, Any]:

@@ -72,79 +72,96 @@ def login_router(context: Context) -> APIRouter:
     return router
 
 
-def panel_router(context: Context, session: Session) -> APIRouter:
-    """The routes of a session."""
-    router = APIRouter(prefix="/api", tags=["session"])
-    settings = context.settings
+class _Driving:
+    """What the routes of a session share."""
 
-    line = threading.BoundedSemaphore(_MOST_WAITING)
+    def __init__(self, context: Context, session: Session) -> None:
+        self.context, self.session = context, session
+        self._line = threading.BoundedSemaphore(_MOST_WAITING)
+
+    def state(self, writer: str | None, slot: int = 0) -> SessionState:
+        """The state as a client sees it, which has shown itself with that."""
+        writers = self.context.writers
+        writers.touch(writer)
+        own, held = writers.holds(SESSION, writer), writers.is_held(SESSION)
+        return replace(self.session.state(slot), writer=own, writer_held=held, url_3d=self.context.url_3d)
 
     @contextmanager
-    def in_line() -> Iterator[None]:
-        """One of the requests that wait for the session; they have threads, of which others need some too."""
-        if not line.acquire(blocking=False):
+    def writing(self, writer: str | None) -> Iterator[None]:
+        """A client changes the session: one of a few requests that wait for it.
+
+        They take threads, of which requests that only read need some too.
+        """
+        self.context.writers.claim(SESSION, writer)
+        if not self._line.acquire(blocking=False):
             raise Refused(503, f"{_MOST_WAITING} requests wait for the session already", retry_after="1")
         try:
             yield
         finally:
-            line.release()
+            self._line.release()
 
-    def own_state(writer: str | None, slot: int = 0) -> SessionState:
-        context.writers.touch(writer)
-        held = context.writers.is_held(SESSION)
-        own = context.writers.holds(SESSION, writer)
-        return replace(session.state(slot), writer=own, writer_held=held, url_3d=context.url_3d)
 
+def panel_router(context: Context, session: Session) -> APIRouter:
+    """The routes of a session."""
+    router, driving = APIRouter(prefix="/api", tags=["session"]), _Driving(context, session)
+    _add_reading(router, driving)
+    _add_building(router, driving)
+    _add_acting(router, driving)
+    return router
+
+
+def _add_reading(router: APIRouter, driving: _Driving) -> None:
     @router.get("/session")
     async def read(slot: Slot = 0, writer: WriterName = None) -> SessionState:
         """The session as it is now; ``planning`` is of ``slot``."""
-        return own_state(writer, slot)
+        return driving.state(writer, slot)
 
     @router.get("/session/history")
     def history(slot: Slot = 0, writer: WriterName = None) -> History:
         """What was recorded of the episode that a slot runs, one row a control tick."""
-        context.writers.touch(writer)
-        return session.history(slot)
-
-    @router.post("/session", status_code=202, responses=CONFLICT)
-    def build(body: SessionBody, writer: WriterName = None) -> SessionState:
-        """Build a batch and a policy; the session is "building", then "ready" or "error"."""
-        context.writers.claim(SESSION, writer)
-        check_request(body, settings, session.base)
-        with in_line():
-            session.build(session.config_for(body.suite, **_changes(body, settings.max_slots)))
-        return own_state(writer)
-
-    @router.post("/session/speed", responses=CONFLICT)
-    def speed(body: SpeedBody, writer: WriterName = None) -> SessionState:
-        """Limit the speed."""
-        context.writers.claim(SESSION, writer)
-        session.set_speed(body.ticks_per_second)
-        return own_state(writer)
-
-    @router.post("/panel/fields", responses=CONFLICT)
-    def choose(body: FieldBody, writer: WriterName = None) -> FieldAnswer:
-        """Choose a suite, a task or an episode, which is placed in one slot."""
-        context.writers.claim(SESSION, writer)
-        with in_line():
-            fields = session.set_field(body.name, body.value)
-        return FieldAnswer(fields=fields, snapshot=fields)
-
-    @router.post("/panel/actions", responses=CONFLICT)
-    def act(body: ActionBody, writer: WriterName = None) -> ActionAnswer:
-        """Play, pause, step, stop or reset."""
-        context.writers.claim(SESSION, writer)
-        with in_line():
-            signal = session.act(body.action, body.ticks)
-        state = own_state(writer)
-        return ActionAnswer(state=state.state, signal_name=signal, session=state)
+        driving.context.writers.touch(writer)
+        return driving.session.history(slot)
 
     @router.delete("/writer")
     def release(writer: WriterName = None) -> Done:
         """Let go of everything that this client drives."""
         if writer is None:
             raise Refused(400, "the header X-Writer names the client that lets go", "X-Writer")
-        context.writers.release(writer)
+        driving.context.writers.release(writer)
         return Done()
 
-    return router
+
+def _add_building(router: APIRouter, driving: _Driving) -> None:
+    session, settings = driving.session, driving.context.settings
+
+    @router.post("/session", status_code=202, responses=CONFLICT)
+    def build(body: SessionBody, writer: WriterName = None) -> SessionState:
+        """Build a batch and a policy; the session is "building", then "ready" or "error"."""
+        with driving.writing(writer):
+            check_request(body, settings, session.base)
+            session.build(session.config_for(body.suite, **_changes(body, settings.max_slots)))
+        return driving.state(writer)
+
+    @router.post("/panel/fields", responses=CONFLICT)
+    def choose(body: FieldBody, writer: WriterName = None) -> FieldAnswer:
+        """Choose a suite, a task or an episode, which is placed in one slot."""
+        with driving.writing(writer):
+            fields = session.set_field(body.name, body.value)
+        return FieldAnswer(fields=fields, snapshot=fields)
+
+
+def _add_acting(router: APIRouter, driving: _Driving) -> None:
+    @router.post("/panel/actions", responses=CONFLICT)
+    def act(body: ActionBody, writer: WriterName = None) -> ActionAnswer:
+        """Play, pause, step, stop or reset."""
+        with driving.writing(writer):
+            signal = driving.session.act(body.action, body.ticks)
+        state = driving.state(writer)
+        return ActionAnswer(state=state.state, signal_name=signal, session=state)
+
+    @router.post("/session/speed", responses=CONFLICT)
+    def speed(body: SpeedBody, writer: WriterName = None) -> SessionState:
+        """Limit the speed."""
+        with driving.writing(writer):
+            driving.session.set_speed(body.ticks_per_second)
+        return driving.state(writer)
