@@ -436,7 +436,9 @@ class Session:
             if self._budget:
                 self._budget -= 1
             elif self._speed:
-                self._next_tick = max(self._next_tick + 1 / self._speed, time.monotonic())
+                now, period = time.monotonic(), 1 / self._speed
+                # A tick that came a little late does not delay the next one.
+                self._next_tick = (self._next_tick if now - self._next_tick < period else now) + period
         if self._batch is not None:
             self._batch.plans.at(self._monitor.tick)
 
