@@ -350,8 +350,7 @@ class Session:
     def _turn(self) -> None:
         """Do what was asked for: build, run, reset; or wait."""
         with self._cond:
-            order, self._order, self._stop = self._order, None, False
-            reset = self._reset
+            order, self._order, reset, self._stop = self._order, None, self._reset, False
         try:
             if order is not None:
                 self._build(order)
