@@ -37,7 +37,10 @@ const stream = new Stream({
   frame: (header, image) => views.take(header, image),
   wall: (header, image) => wall.take(header, image),
   problem: (sentence) => complain(sentence, "stream"),
-  up: connectedAgain,
+  up: () => {
+    stream.keep(WRITER);
+    return connectedAgain();
+  },
   down: disconnected,
 });
 
@@ -165,7 +168,7 @@ function render() {
   slots.show(state, followed);
   showPlan(state.planning, followed);
   document.querySelector(".all").classList.toggle("few", count < 2);
-  document.querySelector(".page").classList.toggle("empty", count === 0);
+  document.querySelector(".page").classList.toggle("empty", count === 0 && state.state !== "building");
   view3d();
   enable();
 }
