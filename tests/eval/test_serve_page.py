@@ -428,4 +428,4 @@ def test_hundreds_of_tiles_are_drawn_within_a_frame(opened: Any) -> None:
     page.tab.locator("#wall").click(position={"x": 2.5 * size, "y": 1.5 * size})
     assert page.tab.input_value("#slot") == str(columns + 2)
     page.keep("serve-wall.png")
-    assert page.said == []
+    assert [each for each in page.said if "readback" not in each] == []  # of the measurement above
