@@ -20,7 +20,9 @@ from support.browser import chromium
 from support.panel_server import World, free_port, make_app, playing, serving
 
 WIDE, PHONE = {"width": 1440, "height": 900}, {"width": 400, "height": 800}
-HOSTILE = "<img src=x onerror=document.title='owned'><b>put</b> the \u202ebowl</option></select><script>alert(1)</script>"
+HOSTILE = (
+    "<img src=x onerror=document.title='owned'><b>put</b> the \u202ebowl</option></select><script>alert(1)</script>"
+)
 
 
 @pytest.fixture(scope="module")

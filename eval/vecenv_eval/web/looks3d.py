@@ -30,8 +30,8 @@ from vecenv_eval.web.shapes3d import glb_of_bodies
 _HIDDEN = ("wall", "published_skin")
 _COLLISION_GROUP = 0
 POINTS_NOTE = (
-    "Objects are points on their collision meshes and the end effector is a set of axes: SAPIEN's scenes live in worker "
-    "processes, which send poses of objects and of the hand, but not of the robot's links."
+    "Objects are points on their collision meshes and the end effector is a set of axes: SAPIEN's scenes live in "
+    "worker processes, which send the poses of objects and of the hand, but not those of the robot's links."
 )
 
 

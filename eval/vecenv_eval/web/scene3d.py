@@ -13,6 +13,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,47 +32,50 @@ HOST = "127.0.0.1"
 # Looks a second at most, and how far a body moves before the browser is told: metres, and parts of a unit quaternion.
 _RATE, _STILL = 15.0, 1e-5
 _AXES, _POINT, _VOXEL = 0.08, 0.006, 0.008
-# Of a value map the best voxels are shown: this part of those that differ from the worst, and no more than that many.
-_BEST, _MOST_VOXELS = 0.04, 6000
+# Of a value map the best voxels are shown: one in so many of those that differ from the worst, and at most so many.
+_ONE_IN, _MOST_VOXELS = 25, 6000
+# As in the pages of `vecenv voxposer show`: targets, what is kept away from, the planner's path, the hand's way.
+_TARGET, _AVOID, _PATH, _HAND = (10, 154, 75), (217, 48, 37), (26, 115, 232), (242, 153, 0)
 _GREY = (150, 156, 165)
+# Of objects, readable on white and on black (after Okabe and Ito).
+_COLORS = ((42, 143, 216), (230, 159, 0), (204, 121, 167), (0, 158, 115), (86, 180, 233), (213, 94, 0))
 
 
 class Scene3D:
-    """The 3-D view.
+    """The 3-D view: an observer of a session (``vecenv_eval.panel.session.Observer``).
 
     Args:
         port: of the view's server; 0 takes any that is free.
-        on_follow: called with a slot that is chosen in the view, so that it is shown also while nothing moves.
 
     Attributes:
         url: its address.
         slot: the slot that is shown.
+        on_due: called, on any thread, when the environment should be looked at although it does not move: somebody
+            has come, another slot was chosen, or the last move was too soon after the one before.
 
     Raises:
         MissingDependency: viser is not installed.
         InvalidInput: the port cannot be used.
     """
 
-    def __init__(self, port: int = 0, on_follow: Callable[[int], None] = lambda slot: None) -> None:
+    def __init__(self, port: int = 0) -> None:
         self.slot = 0
-        self._on_follow = on_follow
+        self.on_due: Callable[[], None] = lambda: None
         self._server = _serve(port)
         self.url = f"http://{HOST}:{self._server.get_port()}/"
-        self._wake, self._closed = threading.Condition(), False
+        self._wake, self._closed, self._due = threading.Condition(), False, False
         self._offered: Look | None = None
-        self._motion: PlannedMotion | None = None
-        self._motions: dict[int, PlannedMotion] = {}
-        self._taken_at = 0.0
+        self._taken_at, self._count = 0.0, 1
+        self._plans: dict[int, PlanLook] = {}
         self._key: object = None
         self._frames: dict[str, Any] = {}
         self._poses: dict[str, np.ndarray] = {}
         self._plan: list[Any] = []
-        self._drawn_motion: PlannedMotion | None = None
-        self._gui = _Gui(self._server, self._chosen)
-        self._thread = threading.Thread(target=self._run, name="view-3d", daemon=True)
+        self._drawn_plan: PlanLook | None = None
+        self._gui = _Gui(self._server, self._choose)
+        self._server.on_client_connect(lambda _: self.on_due())
+        self._thread = threading.Thread(target=self._run, name="vecenv-view-3d", daemon=True)
         self._thread.start()
-
-    # -- from other threads --------------------------------------------------------------------------------------------
 
     @property
     def watched(self) -> bool:
@@ -79,36 +83,16 @@ class Scene3D:
         return bool(self._server.get_clients())
 
     def follow(self, slot: int) -> None:
-        """Show another slot from the next look on."""
+        """Show another slot."""
         if slot != self.slot:
-            self.slot, self._taken_at = slot, 0.0
+            self.slot = slot
             self._gui.slot.value = slot
+            self.on_due()
 
-    def changed(self, env: BatchEnv, *, now: bool = False) -> None:
-        """Take a look at the slot, if it is time for one; on the environment's thread.
-
-        Args:
-            env: the environment.
-            now: also if the last look was a moment ago; for the end of a run, and for another slot.
-        """
-        if not self.watched or not (now or time.monotonic() - self._taken_at >= 1 / _RATE):
-            return
-        self._taken_at = time.monotonic()
-        self._gui.slots(env.num_envs)
-        taken = look(env, min(self.slot, env.num_envs - 1))
-        if taken is not None:
-            with self._wake:
-                self._offered = taken
-                self._motion = self._motions.get(self.slot)
-                self._wake.notify()
-
-    def planned(self, motion: PlannedMotion) -> None:
-        """Show a motion that was planned, while its slot is followed; on the environment's thread."""
-        self._motions[motion.slot] = motion
-
-    def begin(self) -> None:
-        """Forget what was planned: another run begins."""
-        self._motions.clear()
+    def _choose(self, slot: int) -> None:
+        if slot != self.slot:
+            self.slot = slot
+            self.on_due()
 
     def close(self) -> None:
         """Stop the server. Closing twice is harmless."""
@@ -121,31 +105,74 @@ class Scene3D:
         with _silent():
             self._server.stop()
 
+    # -- on the environment's thread -----------------------------------------------------------------------------------
+
+    def placed(self, env: BatchEnv) -> None:
+        """Episodes stand at their start; what was planned is forgotten."""
+        self._plans.clear()
+        self.look(env)
+
+    def tick(self, env: BatchEnv) -> None:
+        """Take a look at the slot, if it is time for one."""
+        if time.monotonic() - self._taken_at >= 1 / _RATE:
+            self.look(env)
+        elif not self._due:
+            with self._wake:
+                self._due = True
+                self._wake.notify()
+
+    def look(self, env: BatchEnv) -> None:
+        """Take a look at the slot, if somebody watches."""
+        self._due = False
+        if not self.watched:
+            return
+        self._taken_at = time.monotonic()
+        taken = look(env, min(self.slot, env.num_envs - 1))
+        with self._wake:
+            self._count = env.num_envs
+            self._offered = taken
+            self._wake.notify()
+
+    def planned(self, motion: PlannedMotion) -> None:
+        """Keep what there is to see of a motion, while somebody watches."""
+        if self.watched:
+            self._plans[motion.slot] = plan_look(motion)
+
+    def lost(self) -> None:
+        """The environment is closed; its last look stays."""
+        self._plans.clear()
+
     # -- the view's own thread -----------------------------------------------------------------------------------------
 
-    def _chosen(self, slot: int) -> None:
-        if slot != self.slot:
-            self.slot, self._taken_at = slot, 0.0
-            self._on_follow(slot)
-
     def _run(self) -> None:
-        while True:
-            with self._wake:
-                self._wake.wait_for(lambda: self._closed or self._offered is not None)
-                if self._closed:
-                    return
-                taken, self._offered = self._offered, None
-                motion = self._motion
-            assert taken is not None
+        while (taken := self._next()) is not None:
             try:
-                self._draw(taken, motion)
+                self._gui.slots(self._count)
+                self._draw(taken)
             except VecenvError as error:
                 self._gui.say(str(error))
             except Exception:  # a view that fails must not end the session
                 log.exception("the 3-D view failed")
                 self._gui.say("The 3-D view failed; the log of the server says why.")
 
-    def _draw(self, taken: Look, motion: PlannedMotion | None) -> None:
+    def _next(self) -> Look | None:
+        """The newest look; None once the view is closed. A move that came too soon is asked for again."""
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._closed or self._offered is not None or self._due)
+                if self._closed:
+                    return None
+                taken, self._offered = self._offered, None
+                if taken is not None:
+                    return taken
+                wait = 1 / _RATE - (time.monotonic() - self._taken_at)
+                if wait > 0 and self._wake.wait_for(lambda: self._closed or self._offered is not None, wait):
+                    continue
+                due, self._due = self._due, False
+            if due:
+                self.on_due()
+
+    def _draw(self, taken: Look) -> None:
         poses = taken.poses()
         if taken.key != self._key:
             self._build(taken, poses)
@@ -156,9 +183,10 @@ class Scene3D:
                     continue
                 frame.position, frame.wxyz = pose[:3], pose[3:7]
                 self._poses[name] = pose
-        if motion is not self._drawn_motion:
-            self._drawn_motion = motion
-            self._draw_plan(motion)
+        plan = self._plans.get(self.slot)
+        if plan is not self._drawn_plan:
+            self._drawn_plan = plan
+            self._draw_plan(plan)
 
     def _build(self, taken: Look, poses: Mapping[str, np.ndarray]) -> None:
         """Replace the bodies by those of another scene."""
@@ -174,7 +202,9 @@ class Scene3D:
                 scene.add_glb(f"/{body.name}/shape", body.glb)
             elif body.points is not None and len(body.points):
                 color = _GREY if body.name == "surroundings" else _color(body.name)
-                scene.add_point_cloud(f"/{body.name}/points", body.points, color, point_size=_POINT, point_shape="circle")
+                scene.add_point_cloud(
+                    f"/{body.name}/points", body.points, color, point_size=_POINT, point_shape="circle"
+                )
         if "hand" in poses:
             self._frames["hand"] = scene.add_frame("/hand", axes_length=_AXES, axes_radius=_AXES / 25)
             if first:
@@ -185,36 +215,32 @@ class Scene3D:
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
-    def _draw_plan(self, motion: PlannedMotion | None) -> None:
+    def _draw_plan(self, plan: PlanLook | None) -> None:
         for handle in self._plan:
             handle.remove()
         self._plan = []
-        self._gui.subtask.value = "" if motion is None else motion.text
-        if motion is None:
+        self._gui.subtask.value = "" if plan is None else plan.text
+        if plan is None:
             return
-        from voxposer import figures
+        self._line("/plan/path", plan.path, _PATH)
+        self._line("/plan/way", plan.stops[:, :3], _HAND)
+        if len(plan.stops):
+            add, size = self._server.scene.add_batched_axes, {"axes_length": 0.03, "axes_radius": 0.0012}
+            self._plan.append(add("/plan/stops", plan.stops[:, 3:], plan.stops[:, :3], **size))
+        self._cloud("/plan/targets", plan.targets, _TARGET)
+        self._cloud("/plan/avoid", plan.avoid, _AVOID, self._gui.avoidance.value)
+        self._cloud("/plan/value", plan.value, plan.value_colors, self._gui.value.value)
 
-        scene, found = self._server.scene, figures.layers(motion)
-        self._line("/plan/path", found["planner's path"], figures.PATH)
-        self._line("/plan/way", found["hand's way"], figures.HAND)
-        if motion.stops:
-            quats, points = (np.array([getattr(stop, name) for stop in motion.stops]) for name in ("quat", "pos"))
-            self._plan.append(scene.add_batched_axes("/plan/stops", quats, points, axes_length=0.03, axes_radius=0.0012))
-        self._cloud("/plan/targets", found["targets"], figures.TARGET)
-        self._cloud("/plan/avoid", _thinned(found["keep away"]), figures.AVOID, self._gui.avoidance.value)
-        points, colors = value_cloud(motion)
-        self._cloud("/plan/value", points, colors, self._gui.value.value)
-
-    def _line(self, name: str, points: np.ndarray, color: str) -> None:
+    def _line(self, name: str, points: np.ndarray, color: tuple[int, int, int]) -> None:
         if len(points) > 1:
             ends = np.stack([points[:-1], points[1:]], axis=1)
-            made = self._server.scene.add_line_segments(name, ends, _rgb(color), thickness=0.004)
-            self._plan.append(made)
+            self._plan.append(self._server.scene.add_line_segments(name, ends, color, thickness=0.004))
 
-    def _cloud(self, name: str, points: np.ndarray, colors: str | np.ndarray, visible: bool = True) -> None:
+    def _cloud(
+        self, name: str, points: np.ndarray, colors: tuple[int, int, int] | np.ndarray, visible: bool = True
+    ) -> None:
         if len(points):
-            shown = _rgb(colors) if isinstance(colors, str) else colors
-            made = self._server.scene.add_point_cloud(name, points, shown, point_size=_VOXEL, visible=visible)
+            made = self._server.scene.add_point_cloud(name, points, colors, point_size=_VOXEL, visible=visible)
             self._plan.append(made)
 
 
@@ -250,6 +276,45 @@ class _Gui:
             handle.visible = visible
 
 
+@dataclass(frozen=True)
+class PlanLook:
+    """What there is to see of a planned motion; its maps, 8 MB each, are not kept.
+
+    Attributes:
+        text: the subtask in words.
+        path: the planner's way, metres, world frame, [P, 3].
+        stops: poses of the hand along it, xyz + wxyz, [S, 7].
+        targets, avoid: centres of voxels that it goes to, and that it stays away from, [n, 3].
+        value: centres of the best voxels of the map that was descended, [n, 3].
+        value_colors: theirs, uint8 [n, 3]; the best are yellow.
+    """
+
+    text: str
+    path: np.ndarray
+    stops: np.ndarray
+    targets: np.ndarray
+    avoid: np.ndarray
+    value: np.ndarray
+    value_colors: np.ndarray
+
+
+def plan_look(motion: PlannedMotion) -> PlanLook:
+    """What there is to see of a motion."""
+    from voxposer.figures import layers
+
+    found = layers(motion)
+    value, colors = value_cloud(motion)
+    return PlanLook(
+        text=motion.text,
+        path=found["planner's path"],
+        stops=np.array([np.append(stop.pos, stop.quat) for stop in motion.stops]).reshape(-1, 7),
+        targets=_thinned(found["targets"]),
+        avoid=_thinned(found["keep away"]),
+        value=value,
+        value_colors=colors,
+    )
+
+
 def value_cloud(motion: PlannedMotion) -> tuple[np.ndarray, np.ndarray]:
     """The best voxels of the value map that a motion was planned on.
 
@@ -265,15 +330,17 @@ def value_cloud(motion: PlannedMotion) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     flat = np.where(np.isfinite(values), values, np.inf).ravel()
     useful = np.flatnonzero(flat < np.max(flat[np.isfinite(flat)], initial=0.0))
-    count = min(_MOST_VOXELS, int(np.ceil(_BEST * len(useful))))
-    best = useful[np.argsort(flat[useful], kind="stable")[:count]]
+    count = min(_MOST_VOXELS, -(-len(useful) // _ONE_IN))
+    if not count:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    best = useful[np.argpartition(flat[useful], count - 1)[:count]]
     points = motion.perception.grid.world(np.stack(np.unravel_index(best, values.shape), axis=1))
     return points, _viridis(_ranks(flat[best]))
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:
     """1 for the smallest of some values, 0 for the largest."""
-    spread = float(np.ptp(values)) if len(values) else 0.0
+    spread = float(np.ptp(values))
     return np.ones(len(values)) if spread == 0 else 1 - (values - values.min()) / spread
 
 
@@ -287,16 +354,9 @@ def _thinned(points: np.ndarray) -> np.ndarray:
     return points[:: max(1, -(-len(points) // _MOST_VOXELS))]
 
 
-def _rgb(color: str) -> tuple[int, int, int]:
-    red, green, blue = (int(color[i : i + 2], 16) for i in (1, 3, 5))
-    return red, green, blue
-
-
 def _color(name: str) -> tuple[int, int, int]:
     """A colour that a name always has."""
-    from voxposer.figures import COLORS
-
-    return _rgb(COLORS[sum(name.encode()) % len(COLORS)])
+    return _COLORS[sum(name.encode()) % len(_COLORS)]
 
 
 def _serve(port: int) -> viser.ViserServer:
@@ -314,7 +374,9 @@ def _serve(port: int) -> viser.ViserServer:
         raise InvalidInput(f"the port of the 3-D view, {port}, is in use: give another one, or 0 for any")
     server.scene.set_up_direction("+z")
     server.scene.add_grid("/grid", width=4, height=4, cell_size=0.25, section_size=1.0, position=(0, 0, -0.001))
-    server.gui.configure_theme(control_layout="collapsible", control_width="small", show_logo=False, show_share_button=False)
+    server.gui.configure_theme(
+        control_layout="collapsible", control_width="small", show_logo=False, show_share_button=False
+    )
     return server
 
 
