@@ -65,6 +65,7 @@ class Scene3D:
         self.url = f"http://{HOST}:{self._server.get_port()}/"
         self._wake, self._closed, self._due = threading.Condition(), False, False
         self._offered: Look | None = None
+        self._latest: Look | None = None
         self._taken_at, self._count = 0.0, 1
         self._plans: dict[int, PlanLook] = {}
         self._key: object = None
@@ -73,7 +74,7 @@ class Scene3D:
         self._plan: list[Any] = []
         self._drawn_plan: PlanLook | None = None
         self._gui = _Gui(self._server, self._choose)
-        self._server.on_client_connect(lambda _: self.on_due())
+        self._server.on_client_connect(lambda _: self._welcome())
         self._thread = threading.Thread(target=self._run, name="vecenv-view-3d", daemon=True)
         self._thread.start()
 
@@ -88,6 +89,11 @@ class Scene3D:
             self.slot = slot
             self._gui.slot.value = slot
             self.on_due()
+
+    def _welcome(self) -> None:
+        """Somebody has come: show what was seen last, and ask for what is to be seen now."""
+        self._offer()
+        self.on_due()
 
     def _choose(self, slot: int) -> None:
         if slot != self.slot:
@@ -110,7 +116,7 @@ class Scene3D:
     def placed(self, env: BatchEnv) -> None:
         """Episodes stand at their start; what was planned is forgotten."""
         self._plans.clear()
-        self.look(env)
+        self._take(env)
 
     def tick(self, env: BatchEnv) -> None:
         """Take a look at the slot, if it is time for one."""
@@ -124,13 +130,18 @@ class Scene3D:
     def look(self, env: BatchEnv) -> None:
         """Take a look at the slot, if somebody watches."""
         self._due = False
-        if not self.watched:
-            return
+        if self.watched:
+            self._take(env)
+
+    def _take(self, env: BatchEnv) -> None:
         self._taken_at = time.monotonic()
-        taken = look(env, min(self.slot, env.num_envs - 1))
+        self._count, self._latest = env.num_envs, look(env, min(self.slot, env.num_envs - 1))
+        if self.watched:
+            self._offer()
+
+    def _offer(self) -> None:
         with self._wake:
-            self._count = env.num_envs
-            self._offered = taken
+            self._offered = self._latest
             self._wake.notify()
 
     def planned(self, motion: PlannedMotion) -> None:
@@ -139,8 +150,9 @@ class Scene3D:
             self._plans[motion.slot] = plan_look(motion)
 
     def lost(self) -> None:
-        """The environment is closed; its last look stays."""
+        """The environment is closed; what the view shows stays."""
         self._plans.clear()
+        self._latest = None
 
     # -- the view's own thread -----------------------------------------------------------------------------------------
 

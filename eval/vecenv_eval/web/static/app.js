@@ -199,7 +199,7 @@ const may = (id) => by(id).getAttribute("aria-disabled") !== "true";
 function cameraNames() {
   const there = state.cameras ?? [];
   const box = by("camera-names");
-  box.hidden = there.length < 3;
+  by("camera-choice").hidden = there.length < 2;
   const labels = there.map((name) => {
     const label = element("label", "", "check");
     const check = element("input");

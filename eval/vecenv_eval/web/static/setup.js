@@ -212,8 +212,14 @@ export class Setup {
     this.taskChanged();
     this.select("episode", several ? Math.min(...state.slots.map((slot) => slot.episode)) : state.episode);
     if (state.num_slots) by("slots").value = state.num_slots;
-    this.select("policy", state.policy);
+    this.select("policy", this.policyOf(state.policy));
     this.describe();
     this.place();
+  }
+
+  /** The policy in the list that a running one is: a policy may add to its name, such as the model it asks. */
+  policyOf(running) {
+    const found = this.policies.map((each) => each.name).filter((name) => running?.startsWith(name));
+    return found.sort((a, b) => b.length - a.length)[0];
   }
 }
