@@ -102,4 +102,4 @@ def _check_render(field: str, value: object) -> None:
 def _is_plain(value: object) -> bool:
     if isinstance(value, str):
         return len(value) <= _LONGEST_TEXT and value.replace("_", "").replace("-", "").isalnum()
-    return value is None or isinstance(value, bool | int | float) and abs(value) <= _LARGEST_NUMBER
+    return value is None or (isinstance(value, bool | int | float) and abs(value) <= _LARGEST_NUMBER)

@@ -6,6 +6,7 @@ runs on one thread of its own, one call after the other. Arrays and images of th
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import importlib
 import inspect
@@ -16,7 +17,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, is_dataclass
 from typing import Any
 
-import asyncio
 import numpy as np
 from fastapi import APIRouter
 from pydantic import BaseModel, ValidationError
