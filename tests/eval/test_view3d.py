@@ -18,8 +18,9 @@ from support.simpler_batches import CARROT, OPEN_TOP, batch
 import vecenv
 from vecenv.errors import InvalidInput
 
-trimesh = pytest.importorskip("trimesh")
+pytest.importorskip("trimesh")
 pytest.importorskip("viser", reason="needs viser: pip install 'vecenv[viser]'")
+import trimesh
 from vecenv_eval.web import scene3d
 from vecenv_eval.web.looks3d import POINTS_NOTE, look
 from vecenv_eval.web.scene3d import PlanLook, Scene3D
