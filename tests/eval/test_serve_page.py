@@ -335,6 +335,28 @@ def test_the_error_of_the_session_is_shown(opened: Any) -> None:
     page.world.error = "the policy raised ValueError: no weights"
     page.until("!document.getElementById('problem').hidden")
     assert page.text("#problem p") == page.world.error
+    page.tab.click("#problem button")
+    page.tab.click("#step")
+    page.until("document.getElementById('steps').textContent.startsWith('1 of')")
+    assert page.tab.locator("#problem").is_hidden()  # it was read
+
+
+def test_the_3d_view_is_opened_on_request_and_told_the_slot(opened: Any) -> None:
+    page = opened().ready().load(slots=3)
+    assert page.tab.locator("#view3d").is_hidden()
+    with serving(make_app(World()), free_port()) as address:
+        page.world.url_3d = f"{address}/static/style.css"
+        page.tab.wait_for_selector("#view3d summary")
+        assert page.tab.locator("iframe").count() == 0
+        page.tab.click("#view3d summary")
+        page.tab.wait_for_selector("#view3d iframe")
+        page.until("document.querySelector('#view3d iframe').contentWindow.length === 0")
+        page.tab.keyboard.press("ArrowRight")
+        page.until("document.getElementById('slot').value === '1'")
+        page.tab.wait_for_timeout(200)
+        assert page.world.shown[-1] == 1
+        assert page.tab.get_attribute("#view3d-link", "href") == page.world.url_3d
+    assert page.said == [f"asked for {page.world.url_3d}"]  # and nothing about the page's policy
 
 
 def test_it_connects_again_when_the_server_comes_back(opened: Any) -> None:

@@ -49,6 +49,7 @@ class World:
     limit: float | None = None
     bodies: list[Any] = field(default_factory=list)
     subscriptions: list[Any] = field(default_factory=list)
+    shown: list[int] = field(default_factory=list)
 
     def build(self, body: dict[str, Any]) -> None:
         first = int(body["episodes"].split("-")[0])
@@ -260,6 +261,11 @@ def make_app(world: World) -> Any:
     @app.post("/api/panel/actions")
     def action(body: dict) -> Any:
         return {"state": world.state, "signal_name": world.act(body["action"], body.get("ticks", 1))}
+
+    @app.post("/api/view3d")
+    def view3d(body: dict) -> Any:
+        world.shown.append(body["slot"])
+        return {"ok": True}
 
     @app.delete("/api/writer")
     def release() -> Any:
