@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from support.fakes import FakeEnv, FakeWorld
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.panel.session import Session
 
+from support.fakes import FakeEnv, FakeWorld
 from vecenv.contract import Watcher
 from vecenv.observations import Egocentric, Rendered
 

@@ -78,7 +78,7 @@ class SlotState:
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint:
-    """A stop of the hand: position (metres) and rotation (wxyz) in the world frame; whether the grip is closed there."""
+    """A stop of the hand: position (metres) and rotation (wxyz), world frame; whether the grip is closed there."""
 
     pos: tuple[float, float, float]
     quat: tuple[float, float, float, float]
