@@ -228,8 +228,8 @@ class Scene3D:
         if "hand" in poses:
             self._frames["hand"] = scene.add_frame("/hand", axes_length=_AXES, axes_radius=_AXES / 25)
             if first:
-                self._server.initial_camera.look_at = poses["hand"][:3] - (0, 0, 0.15)
-                self._server.initial_camera.position = poses["hand"][:3] + (0.75, 0.3, 0.5)
+                self._server.initial_camera.look_at = poses["hand"][:3] - (0, 0, 0.12)
+                self._server.initial_camera.position = poses["hand"][:3] + (0.6, 0.25, 0.4)
         self._key = taken.key
         self._gui.say(model.note)
 

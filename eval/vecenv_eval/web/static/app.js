@@ -192,7 +192,7 @@ function enable() {
     if (id === "slot") by(id).disabled = !on;
     else by(id).setAttribute("aria-disabled", String(!on));
   }
-  by("play").textContent = playing ? "Pause" : is === "paused" ? "Go on" : "Play";
+  by("play").textContent = playing ? "Pause" : is === "paused" ? "Resume" : "Play";
   by("load").textContent = is === "building" ? "Loading\u2026" : "Load";
 }
 
