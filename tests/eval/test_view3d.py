@@ -63,7 +63,11 @@ def until(condition: Any, seconds: float = 60.0) -> None:
 
 
 def vertices(glb: bytes) -> np.ndarray:
-    return trimesh.load(io.BytesIO(glb), file_type="glb").to_geometry().vertices
+    return loaded(glb).to_geometry().vertices
+
+
+def loaded(glb: bytes) -> Any:
+    return trimesh.load(io.BytesIO(glb), file_type="glb")
 
 
 def test_geoms_are_in_the_frame_of_their_body() -> None:
@@ -85,7 +89,7 @@ def test_hidden_geoms_and_groups_are_left_out() -> None:
 
 def test_a_texture_tints_what_has_no_texture_coordinates() -> None:
     model = mujoco.MjModel.from_xml_string(SHAPES)
-    scene = trimesh.load(io.BytesIO(glb_of_bodies(model, groups=(1,))[1]), file_type="glb")
+    scene = loaded(glb_of_bodies(model, groups=(1,))[1])
     colors = [tuple(mesh.visual.material.baseColorFactor[:3]) for mesh in scene.geometry.values()]
     assert (255, 0, 0) in colors
 
@@ -173,7 +177,9 @@ def test_a_plan_is_drawn_and_taken_away(libero: Any, view: Scene3D) -> None:
     view.look(libero)
     until(lambda: len(view._plan) == 6)
     assert view._gui.subtask.value == "<b>move</b>"
-    assert not view._server.scene.get_handle_by_name("/plan/avoid").visible
+    avoid = view._server.scene.get_handle_by_name("/plan/avoid")
+    assert avoid is not None
+    assert not avoid.visible
     view.placed(libero)
     until(lambda: not view._plan)
     assert view._gui.subtask.value == ""
@@ -201,6 +207,7 @@ def test_the_objects_of_simpler_are_points_on_their_surfaces(small: Path) -> Non
         for body in model.bodies:
             if not body.name.startswith("objects/"):
                 continue
+            assert body.points is not None
             rotation = np.zeros(9)
             mujoco.mju_quat2Mat(rotation, poses[body.name][3:7])
             points = body.points @ rotation.reshape(3, 3).T + poses[body.name][:3]

@@ -245,8 +245,10 @@ class Scene3D:
         self._line("/plan/path", plan.path, _PATH)
         self._line("/plan/way", plan.stops[:, :3], _HAND)
         if len(plan.stops):
-            add, size = self._server.scene.add_batched_axes, {"axes_length": 0.03, "axes_radius": 0.0012}
-            self._plan.append(add("/plan/stops", plan.stops[:, 3:], plan.stops[:, :3], **size))
+            scene, points, quats = self._server.scene, plan.stops[:, :3], plan.stops[:, 3:]
+            self._plan.append(
+                scene.add_batched_axes("/plan/stops", quats, points, axes_length=0.03, axes_radius=0.0012)
+            )
         self._cloud("/plan/targets", plan.targets, _TARGET)
         self._cloud("/plan/avoid", plan.avoid, _AVOID, self._gui.avoidance.value)
         self._cloud("/plan/value", plan.value, plan.value_colors, self._gui.value.value)
