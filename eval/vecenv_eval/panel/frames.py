@@ -36,8 +36,9 @@ QUALITY = 80
 MOST_VIEWS = 128
 # Slots of the wall that are drawn in one call, and seconds that one turn of drawing tiles may take.
 _TILES_AT_ONCE, _TURN_S, _IDLE_TURN_S = 8, 0.05, 0.4
-# While a run is played: after drawing for some time, so many times that long pass before it is drawn again.
-_REST = 2.0
+# While a run is played: after drawing for some time, so many times that long pass before it is drawn again, and no more
+# than this many seconds: the first image of a scene takes long, the next ones do not.
+_REST, _LONGEST_REST_S = 2.0, 0.5
 _BACKGROUND = 24
 
 
@@ -181,7 +182,7 @@ class FrameHub:
             self.error = f"images cannot be drawn: {raised(error)}"
         self.preparing, self._has_drawn = False, self._has_drawn or keys != []
         now = time.monotonic()
-        self._not_before = now + _REST * (now - began)
+        self._not_before = now + min(_REST * (now - began), _LONGEST_REST_S)
 
     def draw_ended(self, env: BatchEnv, slots: Sequence[int]) -> None:
         """Draw the views of slots whose episodes have just ended, while the environment shows their end.
