@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vecenv.contract import BatchEnv
-from vecenv.errors import InvalidInput, MissingDependency, SimulationError, VecenvError
+from vecenv.errors import InvalidInput, MissingDependency, ServiceError, VecenvError
 from vecenv_eval.web.looks3d import Look, look
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ class Scene3D:
 
     Raises:
         MissingDependency: viser is not installed.
-        InvalidInput: the port cannot be used.
+        InvalidInput: the port is no port.
+        ServiceError: the port is in use.
     """
 
     def __init__(self, port: int = 0) -> None:
@@ -399,7 +400,7 @@ def _serve(port: int) -> viser.ViserServer:
     if port and server.get_port() != port:  # viser takes the next one that is free
         with _silent():
             server.stop()
-        raise InvalidInput(f"the port of the 3-D view, {port}, is in use: give another one, or 0 for any")
+        raise ServiceError(f"the port of the 3-D view, {port}, is in use: give another one, or 0 for any")
     server.scene.set_up_direction("+z")
     server.scene.add_grid("/grid", width=4, height=4, cell_size=0.25, section_size=1.0, position=(0, 0, -0.001))
     server.gui.configure_theme(control_width="small", show_logo=False, show_share_button=False)
@@ -416,4 +417,4 @@ def _port_errors(port: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SimulationError(f"the 3-D view cannot listen on port {port}: {error}") from error
+        raise ServiceError(f"the 3-D view cannot listen on port {port}: {error}") from error
