@@ -39,6 +39,8 @@ _TILES_AT_ONCE, _TURN_S, _IDLE_TURN_S = 8, 0.05, 0.4
 # While a run is played: after drawing for some time, so many times that long pass before it is drawn again, and no more
 # than this many seconds: the first image of a scene takes long, the next ones do not.
 _REST, _LONGEST_REST_S = 2.0, 0.5
+# Seconds after which nobody is taken to look at a view that was not asked for again.
+_INTEREST_S = 5.0
 _BACKGROUND = 24
 
 
@@ -99,10 +101,11 @@ class FrameHub:
         self.cameras: tuple[str, ...] = ()
         self.image_size: tuple[int, int] | None = None
         self._wanted: dict[Key, None] = {}
+        self._asked: dict[Key, float] = {}
         self._busy: set[Key] = set()
         self._frames: dict[Key, Frame] = {}
         self._tiles = np.zeros((0, TILE, TILE, 3), np.uint8)
-        self._tile_revisions, self._tile_ticks = np.zeros((2, 0), int)
+        self._tile_revisions, self._tile_ticks = np.zeros(0, int), np.zeros(0, int)
         self._not_before = 0.0
         self._generation = object()
 
@@ -115,6 +118,7 @@ class FrameHub:
     def want(self, key: Key) -> None:
         """Ask for one more frame of a view; nothing happens if there is none newer to be had."""
         with self._lock:
+            self._asked[key] = time.monotonic()
             if self.error or key in self._wanted or key in self._busy or not self._is_stale(key):
                 return
             self._wanted[key] = None
@@ -146,7 +150,7 @@ class FrameHub:
                 self.error = how_to_install("PIL")
             count = env.num_envs
             self._tiles = np.full((count, TILE, TILE, 3), _BACKGROUND, np.uint8)
-            self._tile_revisions, self._tile_ticks = np.zeros((2, count), int)
+            self._tile_revisions, self._tile_ticks = np.zeros(count, int), np.zeros(count, int)
 
     def lost(self) -> None:
         """There is no environment any more."""
@@ -187,12 +191,12 @@ class FrameHub:
     def draw_ended(self, env: BatchEnv, slots: Sequence[int]) -> None:
         """Draw the views of slots whose episodes have just ended, while the environment shows their end.
 
-        Of views that somebody has, whether or not they are due: the slot's next image is of another episode.
+        Of views that somebody looks at, whether or not they are due: the slot's next image is of another episode.
         """
+        since = time.monotonic() - _INTEREST_S
         with self._lock:
-            self._wanted.update({key: None for key in self._frames if _slot(key) in slots})
-            if WALL in self._frames:
-                self._wanted[WALL] = None
+            self._asked = {key: asked for key, asked in self._asked.items() if asked > since}
+            self._wanted.update({key: None for key in self._asked if key == WALL or _slot(key) in slots})
         if self._wanted:
             self.draw(env, playing=True, only=slots)
 
