@@ -256,6 +256,22 @@ def test_everything_is_reached_with_the_keyboard_alone(opened: Any) -> None:
     assert page.said == []
 
 
+def test_a_held_key_does_not_flood_the_server(opened: Any) -> None:
+    page = opened().ready().load(slots=15, task="all")
+    page.tab.evaluate("document.activeElement.blur()")
+    before = len(page.world.subscriptions)
+    page.tab.evaluate(
+        """() => {
+            for (let i = 0; i < 14; i += 1)
+                document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true }));
+        }"""
+    )
+    page.tab.wait_for_selector("#cameras canvas[data-slot='14']")
+    asked = [each["subscribe"]["slot"] for each in page.world.subscriptions[before:]]
+    assert asked[-1] == 14
+    assert len(asked) <= 3
+
+
 def test_keys_can_be_switched_off(opened: Any) -> None:
     page = opened().ready().load()
     page.tab.click("#help-open")
@@ -354,7 +370,7 @@ def test_the_3d_view_is_opened_on_request_and_told_the_slot(opened: Any) -> None
         page.until("document.querySelector('#view3d iframe').contentWindow.length === 0")
         page.tab.keyboard.press("ArrowRight")
         page.until("document.getElementById('slot').value === '1'")
-        page.tab.wait_for_timeout(200)
+        page.tab.wait_for_timeout(500)
         assert page.world.shown[-1] == 1
         assert page.tab.get_attribute("#view3d-link", "href") == page.world.url_3d
     assert page.said == [f"asked for {page.world.url_3d}"]  # and nothing about the page's policy

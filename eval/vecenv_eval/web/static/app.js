@@ -15,6 +15,7 @@ const by = (id) => document.getElementById(id);
 const HISTORY_MS = 500;
 const RATES_MS = 1000;
 const KEEP_MS = 20_000; // the server gives the session to others when its writer is silent for a minute
+const TELL_MS = 150; // after the last of several slots that were chosen in a row
 const FPS = 15;
 const SIZE = 384;
 const SHOWN_FIRST = ["agentview", "wrist"];
@@ -24,6 +25,7 @@ let followed = 0;
 let cameras = null; // names the reader chose; null for the first ones
 const sending = new Set(); // requests that are not answered yet
 let connected = false;
+let telling = 0;
 let problemOf = ""; // what the sentence that is shown is about
 let history = { slot: -1, step: -1, episode: "", running: false }; // what the plots show
 
@@ -263,7 +265,10 @@ function view3d() {
 
 /** The 3-D view is a page of its own; it shows the slot that is followed here. */
 function tell3d() {
-  post("/api/view3d", { slot: followed }).catch((error) => complain(error.message, "request"));
+  clearTimeout(telling);
+  telling = setTimeout(() => {
+    post("/api/view3d", { slot: followed }).catch((error) => complain(error.message, "request"));
+  }, TELL_MS);
 }
 
 // -- connection -------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 const FIRST_WAIT_MS = 500;
 const LONGEST_WAIT_MS = 5000;
+const BETWEEN_MS = 120; // between two subscriptions: a held arrow key asks for many, and the server counts messages
 
 /** Split a binary message into its header (JSON) and the JPEG; throws on anything else. */
 export function parse(buffer) {
@@ -18,6 +19,8 @@ export class Stream {
   constructor(on) {
     this.on = on;
     this.wanted = null;
+    this.sent = null;
+    this.later = 0;
     this.wait = FIRST_WAIT_MS;
     this.socket = null;
     this.timer = 0;
@@ -50,11 +53,18 @@ export class Stream {
     const text = JSON.stringify({ subscribe: wanted });
     if (text === this.wanted) return;
     this.wanted = text;
+    if (this.later) return;
     this.send();
+    this.later = setTimeout(() => {
+      this.later = 0;
+      if (this.wanted !== this.sent) this.send();
+    }, BETWEEN_MS);
   }
 
   send() {
-    if (this.wanted !== null && this.socket?.readyState === WebSocket.OPEN) this.socket.send(this.wanted);
+    if (this.wanted === null || this.socket?.readyState !== WebSocket.OPEN) return;
+    this.socket.send(this.wanted);
+    this.sent = this.wanted;
   }
 
   /** Say that this tab still drives the session. */
