@@ -75,6 +75,19 @@ def test_reset_puts_the_episodes_back_to_their_start() -> None:
         assert all(slot.step == 0 and slot.verdict == "live" for slot in state.slots)
 
 
+@pytest.mark.parametrize("action", ["pause", "stop"])
+def test_what_is_taken_back_before_it_has_begun_does_not_begin(action: Action) -> None:
+    with session(config=config(tasks="1", max_steps=1_000_000)) as live:
+        live.wait_until("ready", timeout=20)
+        hold = threading.Event()
+        live.call(lambda env: hold.wait(20))
+        live.act("play")
+        threading.Timer(0.2, hold.set).start()
+        live.act(action)
+        assert live.state().state == "ready"
+        assert live.state().tick == 0
+
+
 def test_stop_ends_a_run_and_play_begins_a_new_one() -> None:
     with session() as live:
         live.wait_until("ready", timeout=20)
@@ -245,6 +258,8 @@ def test_calls_of_many_threads_at_once_leave_a_session_that_works() -> None:
         for thread in threads:
             thread.join(60)
         assert not failures
+        live.act("pause")
+        until(lambda: live.state().state in ("ready", "paused", "finished"))
         live.act("reset")
         live.act("play")
         assert live.wait_until("finished", timeout=20).finished == 6
@@ -325,6 +340,20 @@ def test_the_wall_is_one_image_with_a_tile_a_slot() -> None:
     assert image.shape == (96, 6 * 96, 3)
     middles = image[48, 48::96].astype(int)
     assert np.abs(middles[:, 0] - [40, 60, 80, 100, 120, 140]).max() < 10
+
+
+def test_a_slot_that_is_shown_and_on_the_wall_is_drawn_once() -> None:
+    world = LiveWorld()
+    with session(world, config=config(tasks="1", episodes="3", max_steps=1000)) as live:
+        live.wait_until("ready", timeout=20)
+        hold = threading.Event()
+        held = live.call(lambda env: hold.wait(10))  # both are asked for before any is drawn
+        live.frames.want(View(1, "agentview", 64))
+        live.frames.want(WALL)
+        hold.set()
+        assert held.result(10)
+        until(lambda: live.frames.newest(WALL) and live.frames.newest(View(1, "agentview", 64)))
+    assert sorted(world.last.drawn) == [(slot, "agentview") for slot in range(3)]
 
 
 def test_images_that_cannot_be_drawn_end_no_run() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -189,6 +191,28 @@ def test_an_action_out_of_turn_is_a_conflict(client: TestClient, live: Session) 
             refused(
                 other.post("/api/panel/fields", json={"name": "task", "value": 0}, headers=WRITER), 409, "suite first"
             )
+
+
+def test_requests_that_would_wait_too_long_in_line_are_refused_and_reading_goes_on(
+    client: TestClient, live: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting, release = threading.Semaphore(0), threading.Event()
+
+    def slow(action: str, ticks: int) -> None:
+        waiting.release()
+        release.wait(20)
+
+    monkeypatch.setattr(live, "act", slow)
+    with ThreadPoolExecutor(8) as pool:
+        asked = [
+            pool.submit(client.post, "/api/panel/actions", json={"action": "play"}, headers=WRITER) for _ in "12345678"
+        ]
+        for _ in asked:
+            assert waiting.acquire(timeout=20)
+        refused(client.post("/api/panel/actions", json={"action": "play"}, headers=WRITER), 503, "wait for the session")
+        assert client.get("/api/session").status_code == 200
+        release.set()
+        assert {each.result(20).status_code for each in asked} == {200}
 
 
 def test_a_failure_of_the_server_shows_no_traceback(client: TestClient, live: Session) -> None:

@@ -141,7 +141,8 @@ def _run(
     play: bool,
     access_log: bool,
 ) -> None:
-    from vecenv_eval.panel.session import Session, check_live
+    from vecenv_eval.panel.choices import check_live
+    from vecenv_eval.panel.session import Session
     from vecenv_eval.web.app import create_app
     from vecenv_eval.web.server import Server
 

@@ -28,16 +28,18 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Self
 
-import vecenv
 from vecenv.contract import BatchEnv
 from vecenv.errors import VecenvError
-from vecenv_eval.config import SCRIPTED, EvalConfig, default_policy
-from vecenv_eval.panel import catalog
+from vecenv_eval.config import EvalConfig
+from vecenv_eval.panel import jobs
 from vecenv_eval.panel.batch import LiveBatch
+from vecenv_eval.panel.choices import check_live, chosen, config_for, config_of, first_of
 from vecenv_eval.panel.frames import FrameHub
+from vecenv_eval.panel.jobs import Job
 from vecenv_eval.panel.monitor import Monitor
+from vecenv_eval.panel.observers import Observer, Observers
 from vecenv_eval.panel.state import (
     Fields,
     History,
@@ -50,9 +52,7 @@ from vecenv_eval.panel.state import (
 )
 from vecenv_eval.policies import raised
 from vecenv_eval.results import Progress
-from vecenv_eval.runner import check
 from vecenv_eval.simulator import Simulator, vecenv_simulator
-from voxposer.planned import PlannedMotion
 
 _log = logging.getLogger(__name__)
 Action = Literal["play", "pause", "step", "stop", "reset"]
@@ -68,35 +68,6 @@ _BUILT: frozenset[StateName] = frozenset({"ready", "playing", "paused", "finishe
 
 class RunStopped(KeyboardInterrupt):
     """Raised inside the episode loop, on the session's thread, to end a run as Ctrl-C ends one."""
-
-
-class Observer(Protocol):
-    """Sees the environment on its own thread, as the 3-D view does; what it raises is logged and ends nothing."""
-
-    def placed(self, env: BatchEnv) -> None:
-        """Episodes stand at their start, perhaps in another environment."""
-        ...
-
-    def tick(self, env: BatchEnv) -> None:
-        """A tick has happened, or the environment waits; called often, so be quick."""
-        ...
-
-    def planned(self, motion: PlannedMotion) -> None:
-        """VoxPoser has planned a motion."""
-        ...
-
-    def lost(self) -> None:
-        """The environment is closed."""
-        ...
-
-
-def check_live(config: EvalConfig, simulator: Simulator | None = None) -> None:
-    """Check a config of a session without building anything; raises what :meth:`Session.build` raises."""
-    if len(config.suites) != 1 or config.seeds is not None:
-        raise SessionError("a session runs one suite with one seed")
-    if config.engine != "local":
-        raise SessionError("a session runs in this process: leave out the engine")
-    check(config, simulator or vecenv_simulator())
 
 
 class Session:
@@ -133,18 +104,18 @@ class Session:
         self._order: EvalConfig | None = config
         self._playing, self._budget = play, 0
         self._stop = self._reset = self._closing = self._ending = False
-        self._jobs: list[tuple[Callable[[BatchEnv], Any], Future[Any]]] = []
+        self._jobs: list[Job] = []
         self._waiting = self._started = False
         self._base = self._config = config
         self._fields = Fields()
         self._counts = (0, 0, 0, 0)
         self._batch: LiveBatch | None = None
-        self._observers: list[Observer] = []
+        self._observers = Observers()
         self._temporary = tempfile.TemporaryDirectory(prefix="vecenv-session-")
         self._monitor = Monitor(self._before_tick, self._after_end, self._shown)
         self.frames = FrameHub(self._monitor, self._notify)
         if config is not None:
-            self._select(config)
+            self._fields = first_of(config, self._simulator)
             self._name = "building"
         self._thread = threading.Thread(target=self._main, name="vecenv-session", daemon=True)
         self._thread.start()
@@ -213,11 +184,11 @@ class Session:
             SessionClosed: the session was closed.
         """
         check_live(config, self._simulator)
+        fields = first_of(config, self._simulator)
         with self._cond:
             self._check_open()
             self._order, self._playing, self._budget = config, False, 0
-            self._config, self._counts = config, (0, 0, 0, 0)
-            self._select(config)
+            self._config, self._counts, self._fields = config, (0, 0, 0, 0), fields
             self._set("building", None)
 
     def set_field(self, name: str, value: int | str) -> Fields:
@@ -230,33 +201,13 @@ class Session:
         Raises:
             SessionError: there is no such field, suite, task or episode, or no suite was chosen yet.
         """
-        fields = self._chosen({"split": "suite", "task_id": "task", "episode_index": "episode"}.get(name, name), value)
-        assert fields.suite is not None
-        assert fields.task is not None
-        index = catalog.task_index(fields.suite, fields.task)
-        self.build(self.config_of(fields.suite, tasks=str(index), episodes=f"{fields.episode}-{fields.episode}"))
+        fields = chosen(self._fields, name, value)
+        self.build(config_of(self._config or self._base, fields))
         return fields
 
-    def config_of(self, suite: str, **changes: Any) -> EvalConfig:
-        """A config for a suite: what the session was made with or runs now, with changes.
-
-        What is made for one family of suites (policy, options of images and of the environment) is dropped for another.
-
-        Raises:
-            ConfigError: a value cannot be used.
-        """
-        catalog.check_suite(suite)
-        before = self._config or self._base
-        if before is None:
-            return EvalConfig.from_dict({"suite": suite, **changes})
-        values = {**before.to_dict(), "suite": suite, "num_envs": None}
-        if vecenv.family(suite) != vecenv.family(before.suites[0]):
-            for name in ("image_size", "lod", "colors", "max_steps", "seed", "cameras"):
-                values[name] = None
-            values["env_args"] = {}
-            if before.policy_name in SCRIPTED.values():
-                values |= {"policy": default_policy(suite), "policy_args": {}}
-        return EvalConfig.from_dict({**values, **changes})
+    def config_for(self, suite: str, **changes: Any) -> EvalConfig:
+        """A config for a suite: what runs now, or what the session was made with, with changes (``choices``)."""
+        return config_for(self._config or self._base, suite, **changes)
 
     def act(self, action: Action, ticks: int = 1) -> Signal | None:
         """Play, pause, step, stop or reset.
@@ -316,7 +267,7 @@ class Session:
 
     def observe(self, observer: Observer) -> None:
         """Let an observer see the environment from now on."""
-        self._observers.append(observer)
+        self._observers.add(observer)
         with suppress(SessionClosed):
             self.call(observer.placed)
 
@@ -384,35 +335,6 @@ class Session:
             return self._budget == 0 and (self._waiting or self._name == "finished")
         return action == "play" or self._waiting or self._name in ("ready", "finished")
 
-    def _chosen(self, field: str, value: int | str) -> Fields:
-        """The fields with one of them chosen."""
-        now = self._fields
-        if field == "suite":
-            catalog.check_suite(str(value))
-            return Fields(suite=str(value), task=catalog.tasks(str(value))[0].task, episode=0)
-        if field not in ("task", "episode"):
-            raise SessionError(f"there is no field {field!r}: suite, task or episode")
-        if now.suite is None:
-            raise OutOfTurn("choose a suite first")
-        rows = catalog.tasks(now.suite)
-        if field == "task":
-            return Fields(suite=now.suite, task=rows[catalog.task_index(now.suite, value)].task, episode=0)
-        index = catalog.task_index(now.suite, rows[0].task if now.task is None else now.task)
-        text = str(value)
-        if not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) < rows[index].num_episodes):
-            raise SessionError(
-                f"task {rows[index].task} of {now.suite} has episodes 0 to {rows[index].num_episodes - 1}, no {text!r}"
-            )
-        return Fields(suite=now.suite, task=rows[index].task, episode=int(text))
-
-    def _select(self, config: EvalConfig) -> None:
-        """Show what a config runs in the panel's fields: its first task and episode."""
-        with suppress(VecenvError):
-            suite, tasks, episodes = check(config, self._simulator)
-            named = suite.tasks and config.suite.startswith("simpler/")
-            task = suite.tasks[tasks[0]] if named else tasks[0]
-            self._fields = Fields(suite=suite.name, task=task, episode=episodes[tasks[0]][0])
-
     # -- on the session's thread ---------------------------------------------------------------------------------------
 
     def _main(self) -> None:
@@ -421,7 +343,9 @@ class Session:
                 self._turn()
         finally:
             self._drop_batch()
-            self._fail_jobs(SessionClosed("the session was closed"))
+            with self._cond:
+                jobs.fail(self._jobs, SessionClosed("the session was closed"))
+                self._jobs = []
 
     def _turn(self) -> None:
         """Do what was asked for: build, run, reset; or wait."""
@@ -453,7 +377,7 @@ class Session:
             self._set("building", None)
         limit = config.num_envs or self._max_slots
         self._batch = LiveBatch(replace(config, num_envs=limit), self._simulator)
-        self._batch.plans.on_motion = lambda motion: self._tell("planned", motion)
+        self._batch.plans.on_motion = self._observers.planned
         self._place(self._batch)
 
     def _place(self, batch: LiveBatch) -> None:
@@ -468,7 +392,7 @@ class Session:
     def _shown(self, env: BatchEnv) -> None:
         """Another environment, or the same one placed anew, is there to be seen."""
         self.frames.placed(env)
-        self._tell("placed", env)
+        self._observers.placed(env)
 
     def _run(self, batch: LiveBatch) -> None:
         """Run every episode, until the end or until stopped."""
@@ -501,13 +425,13 @@ class Session:
             self._monitor.settled(env)
         except VecenvError:  # it failed and was closed; another one follows, or none
             return
-        self._tell("tick", env)
+        self._observers.tick(env)
         if not self._ending and not env.done.all():
             self._wait(in_run=True)
 
     def _before_tick(self, env: BatchEnv) -> None:
         """Wait until a tick is allowed; called by the episode loop."""
-        self._tell("tick", env)
+        self._observers.tick(env)
         self._wait(in_run=True)
         with self._cond:
             if self._budget:
@@ -534,9 +458,9 @@ class Session:
                         raise RunStopped
                     return False
                 goes = self._playing or self._budget > 0
-                jobs, self._jobs = self._jobs, []
+                todo, self._jobs = self._jobs, []
                 draw = self._monitor.env is not None and self.frames.is_due(goes and not self._speed)
-                if not jobs and not draw:
+                if not todo and not draw:
                     left = self._next_tick - time.monotonic() if self._speed and self._playing else 0.0
                     if goes and left <= 0:
                         self._waiting = False
@@ -546,7 +470,7 @@ class Session:
                     self._hold(in_run, goes)
                     self._cond.wait(left if goes else None)
                     continue
-            self._do(jobs, draw, goes)
+            self._do(todo, draw, goes)
 
     def _hold(self, in_run: bool, goes: bool) -> None:
         """Say that the run waits; the caller has the lock."""
@@ -554,41 +478,22 @@ class Session:
             return
         if in_run and self._name != "paused":
             self._set("paused", self._error)
+        elif not in_run and self._name == "playing":  # it was paused or stopped before it had begun
+            self._set("finished" if self._started else "ready", self._error)
         if not self._waiting:
             self._waiting = True
             self._cond.notify_all()
 
-    def _do(self, jobs: list[tuple[Callable[[BatchEnv], Any], Future[Any]]], draw: bool, playing: bool) -> None:
+    def _do(self, todo: list[Job], draw: bool, playing: bool) -> None:
         env = self._monitor.env
-        for function, future in jobs:
-            if env is None:
-                future.set_exception(SessionError("nothing is built yet"))
-                continue
-            try:
-                future.set_result(function(env))
-            except Exception as error:  # of whoever asked
-                future.set_exception(error)
+        jobs.do(todo, env)
         if draw and env is not None:
             self.frames.draw(env, playing=playing)
-
-    def _tell(self, what: str, *arguments: Any) -> None:
-        """Call a method of every observer."""
-        for observer in tuple(self._observers):
-            try:
-                getattr(observer, what)(*arguments)
-            except Exception as error:  # who only watches ends nothing
-                _log.warning("%s: %s", type(observer).__name__, raised(error))
 
     def _drop_batch(self) -> None:
         batch, self._batch = self._batch, None
         self._monitor.lost()
         self.frames.lost()
         if batch is not None:
-            self._tell("lost")
+            self._observers.lost()
             batch.close()
-
-    def _fail_jobs(self, error: Exception) -> None:
-        with self._cond:
-            jobs, self._jobs = self._jobs, []
-        for _, future in jobs:
-            future.set_exception(error)

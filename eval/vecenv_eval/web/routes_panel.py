@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -28,6 +31,8 @@ from vecenv_eval.web.permissions import check_request
 from vecenv_eval.web.security import COOKIE, TOO_MANY
 from vecenv_eval.web.writer import WriterName
 
+# Requests that may wait for the session at once.
+_MOST_WAITING = 8
 Slot = Annotated[int, Query(ge=0, lt=MOST_SLOTS)]
 
 
@@ -72,6 +77,18 @@ def panel_router(context: Context, session: Session) -> APIRouter:
     router = APIRouter(prefix="/api", tags=["session"])
     settings = context.settings
 
+    line = threading.BoundedSemaphore(_MOST_WAITING)
+
+    @contextmanager
+    def in_line() -> Iterator[None]:
+        """One of the requests that wait for the session; they have threads, of which others need some too."""
+        if not line.acquire(blocking=False):
+            raise Refused(503, f"{_MOST_WAITING} requests wait for the session already", retry_after="1")
+        try:
+            yield
+        finally:
+            line.release()
+
     def own_state(writer: str | None, slot: int = 0) -> SessionState:
         context.writers.touch(writer)
         held = context.writers.is_held(SESSION)
@@ -79,7 +96,7 @@ def panel_router(context: Context, session: Session) -> APIRouter:
         return replace(session.state(slot), writer=own, writer_held=held, url_3d=context.url_3d)
 
     @router.get("/session")
-    def read(slot: Slot = 0, writer: WriterName = None) -> SessionState:
+    async def read(slot: Slot = 0, writer: WriterName = None) -> SessionState:
         """The session as it is now; ``planning`` is of ``slot``."""
         return own_state(writer, slot)
 
@@ -94,7 +111,8 @@ def panel_router(context: Context, session: Session) -> APIRouter:
         """Build a batch and a policy; the session is "building", then "ready" or "error"."""
         context.writers.claim(SESSION, writer)
         check_request(body, settings, session.base)
-        session.build(session.config_of(body.suite, **_changes(body, settings.max_slots)))
+        with in_line():
+            session.build(session.config_for(body.suite, **_changes(body, settings.max_slots)))
         return own_state(writer)
 
     @router.post("/session/speed", responses=CONFLICT)
@@ -108,14 +126,16 @@ def panel_router(context: Context, session: Session) -> APIRouter:
     def choose(body: FieldBody, writer: WriterName = None) -> FieldAnswer:
         """Choose a suite, a task or an episode, which is placed in one slot."""
         context.writers.claim(SESSION, writer)
-        fields = session.set_field(body.name, body.value)
+        with in_line():
+            fields = session.set_field(body.name, body.value)
         return FieldAnswer(fields=fields, snapshot=fields)
 
     @router.post("/panel/actions", responses=CONFLICT)
     def act(body: ActionBody, writer: WriterName = None) -> ActionAnswer:
         """Play, pause, step, stop or reset."""
         context.writers.claim(SESSION, writer)
-        signal = session.act(body.action, body.ticks)
+        with in_line():
+            signal = session.act(body.action, body.ticks)
         state = own_state(writer)
         return ActionAnswer(state=state.state, signal_name=signal, session=state)
 
