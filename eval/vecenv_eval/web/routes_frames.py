@@ -33,6 +33,8 @@ _PULSE_S = 1 / 60
 # Messages that cannot be read before a reader is disconnected.
 _MOST_MISTAKES = 20
 _STATES = TypeAdapter(SessionState)
+# States that are kept encoded, and the slot of one that is the same whichever slot a reader looks at.
+_MOST_TEXTS, _ANY_SLOT = 1000, -1
 
 
 class Broadcast:
@@ -80,17 +82,19 @@ class Broadcast:
         return (*self._session.version, held, self._context.url_3d, frames.error, frames.preparing)
 
     def text(self, slot: int, writer: str | None) -> str:
-        """The state as a message; of one slot's plan."""
+        """The state as a message; with one slot's plan, if the policy plans."""
         own, stamp = self._context.writers.holds(SESSION, writer), self.stamp()
-        found = self._texts.get((slot, own))
-        if found is None or found[0] != stamp:
-            held = self._context.writers.is_held(SESSION)
-            state = replace(self._session.state(slot), writer=own, writer_held=held, url_3d=self._context.url_3d)
-            text = '{"type":"session",' + _STATES.dump_json(state).decode()[1:]
-            if len(self._texts) > 1000:
-                self._texts.clear()
-            found = self._texts[slot, own] = (stamp, text)
-        return found[1]
+        for key in ((_ANY_SLOT, own), (slot, own)):
+            found = self._texts.get(key)
+            if found is not None and found[0] == stamp:
+                return found[1]
+        held = self._context.writers.is_held(SESSION)
+        state = replace(self._session.state(slot), writer=own, writer_held=held, url_3d=self._context.url_3d)
+        text = '{"type":"session",' + _STATES.dump_json(state).decode()[1:]
+        if len(self._texts) > _MOST_TEXTS:
+            self._texts.clear()
+        self._texts[_ANY_SLOT if state.planning is None else slot, own] = (stamp, text)
+        return text
 
     async def _watch(self) -> None:
         before: object = None
