@@ -390,6 +390,9 @@ def test_observers_see_every_tick_and_what_they_raise_ends_nothing() -> None:
             self.seen.append("tick")
             raise ValueError("a viewer's own mistake")
 
+        def planned(self, motion: object) -> None:
+            raise AssertionError("nothing plans here")
+
         def lost(self) -> None:
             self.seen.append("lost")
 

@@ -79,17 +79,26 @@ def _serve(
     allow_host: list[str] = typer.Option([], help="A further name that the server is called by; repeatable."),
     allow_origin: list[str] = typer.Option([], help="A further origin whose pages may call; repeatable."),
     access_log: bool = typer.Option(False, "--access-log", help="Print a line for every request."),
+    view_3d: bool = typer.Option(
+        False, "--view-3d", help="Also serve a 3-D view, on a port of its own of this machine, without the token."
+    ),
+    port_3d: int | None = typer.Option(
+        None, "--port-3d", min=0, max=65535, help="Port of the 3-D view.", show_default="a free one"
+    ),
     **settings: Any,
 ) -> None:
     """Drive and watch a live batch of environments in the browser."""
-    for module in ("fastapi", "uvicorn", "PIL"):
+    if port_3d is not None and not view_3d:
+        fail("--port-3d needs --view-3d")
+    for module in ("fastapi", "uvicorn", "PIL", *(["viser"] if view_3d else [])):
         if not is_installed(module):
             fail(how_to_install(module), code=1)
     sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
     with user_errors():
         first = _first(settings, config)
         served = _settings(host, token_file, trust_clients, max_slots, allow_host, allow_origin)
-        _run(first, served, out, port, open_browser=open_browser, play=play, access_log=access_log)
+        ports = (port, (port_3d or 0) if view_3d else None)
+        _run(first, served, out, ports, open_browser=open_browser, play=play, access_log=access_log)
 
 
 def _first(settings: dict[str, Any], file: Path | None) -> EvalConfig | None:
@@ -126,7 +135,7 @@ def _run(
     first: EvalConfig | None,
     settings: ServeSettings,
     out: Path | None,
-    port: int,
+    ports: tuple[int, int | None],
     *,
     open_browser: bool,
     play: bool,
@@ -147,12 +156,22 @@ def _run(
         logger = logging.getLogger("vecenv_eval.web.access")
         logger.setLevel(logging.INFO)
         logger.addHandler(Saying(to_stderr))
+    scene = None
+    if ports[1] is not None:
+        from vecenv_eval.web.scene3d import Scene3D
+
+        scene = Scene3D(ports[1])
     with (
         suppress(KeyboardInterrupt),
         reported(),
         Session(first, out=out, max_slots=settings.max_slots, play=play) as session,
     ):
-        server = Server(create_app(session, settings), port)
+        app = create_app(session, settings)
+        if scene is not None:
+            from vecenv_eval.web.routes_view3d import attach_view3d
+
+            attach_view3d(app, session, scene)
+        server = Server(app, ports[0])
 
         def started() -> None:
             typer.echo(f"serving on {server.url}" + (" (the page asks for the token)" if settings.token else ""))

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from vecenv.contract import BatchEnv
 from vecenv_eval.policies import raised
+from voxposer.planned import PlannedMotion
 
 _log = logging.getLogger(__name__)
 
@@ -21,6 +22,10 @@ class Observer(Protocol):
 
     def tick(self, env: BatchEnv) -> None:
         """A tick is about to happen, or a call of the policy has ended; called often, so be quick."""
+        ...
+
+    def planned(self, motion: PlannedMotion) -> None:
+        """VoxPoser has planned a motion."""
         ...
 
     def lost(self) -> None:
@@ -45,6 +50,10 @@ class Observers:
     def tick(self, env: BatchEnv) -> None:
         """Tell all."""
         self._tell(lambda each: each.tick(env))
+
+    def planned(self, motion: PlannedMotion) -> None:
+        """Tell all."""
+        self._tell(lambda each: each.planned(motion))
 
     def lost(self) -> None:
         """Tell all."""

@@ -376,6 +376,7 @@ class Session:
             self._set("building", None)
         limit = config.num_envs or self._max_slots
         self._batch = LiveBatch(replace(config, num_envs=limit), self._simulator)
+        self._batch.plans.on_motion = self._observers.planned
         self._place(self._batch)
 
     def _place(self, batch: LiveBatch) -> None:
