@@ -409,6 +409,7 @@ async def _send_changes(socket: WebSocket, runs: Runs, run: str) -> None:
     seen: Any = None
     sent_rows: int | None = None
     sent_frames: set[Any] = set()
+    processes: list[list[str]] = []
     try:
         while True:
             snapshot, frames, state = await run_in_threadpool(_look, runs, run)
@@ -416,13 +417,13 @@ async def _send_changes(socket: WebSocket, runs: Runs, run: str) -> None:
                 seen = (snapshot.version, state)
                 await socket.send_text(await run_in_threadpool(_change_message, snapshot, state, sent_rows))
                 sent_rows = len(snapshot.rows)
+            if (now := [[frame.leg, frame.header.process] for frame in frames]) != processes:
+                processes = now
+                await socket.send_text(json.dumps({"type": "processes", "processes": processes}))
             for frame in frames:
                 if frame.identity not in sent_frames:
                     await socket.send_bytes(frame.message())
-            gone = bool(sent_frames) and not frames
             sent_frames = {frame.identity for frame in frames}
-            if gone:
-                await socket.send_text(json.dumps({"type": "no frames"}))
             await asyncio.sleep(_LOOK_S)
     except (WebSocketDisconnect, RuntimeError, OSError):
         return  # the reader has gone
