@@ -245,6 +245,17 @@ class SlotBatch(ABC):
         return tuple(self._instruction(slot) for slot in range(self.num_envs))
 
     @property
+    def max_steps(self) -> np.ndarray:
+        """Step budget of each slot in control ticks, int [B], a copy."""
+        return self._max_steps.copy()
+
+    @property
+    def ee_poses(self) -> np.ndarray:
+        """Poses of the end effectors, xyz (metres) and wxyz, world frame, [B, 7], a copy; placed slots only."""
+        self._check_live()
+        return self._tools()
+
+    @property
     def timings(self) -> Timings:
         """Seconds spent so far in physics and in rendering images."""
         return Timings(physics_s=self._physics_s, images_s=self._images_s())

@@ -32,7 +32,7 @@ from vecenv_eval.results import Progress, count
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.sink import Sink
 from vecenv_eval.store import Record, StoreError, write_log
-from vecenv_eval.watch import watching
+from vecenv_eval.watch import EpisodeRecorder, watching
 
 # On a GPU a reset of a few slots costs as much as of all: slots wait until this share of them can begin together.
 _SHARE_TO_REFILL = {"native": 0.0, "physx_cpu": 0.0}
@@ -75,6 +75,9 @@ class EpisodeLoop:
         planned: every episode of the evaluation, those done before included.
         on_progress: called after every call of the policy.
         index: number of this run on the folder, from 0.
+        environments: builds environments and keeps the one in use when the run ends; None for one of the loop's own,
+            which is closed then.
+        recorders: episode recorders beside those that the config asks for.
 
     Attributes:
         causes: what failed, one line each, without repetition.
@@ -91,6 +94,8 @@ class EpisodeLoop:
         planned: Collection[Episode],
         on_progress: Callable[[Progress], None],
         index: int,
+        environments: Environments | None = None,
+        recorders: Sequence[EpisodeRecorder] = (),
     ) -> None:
         self.causes: dict[str, None] = {}
         self._config, self._suite, self._policy, self._simulator = config, suite, policy, simulator
@@ -98,8 +103,9 @@ class EpisodeLoop:
         wanted = frozenset(planned)
         self._records = {key: r for key, r in store.records().items() if key in wanted and not r.error}
         self._progress = _ProgressReports(on_progress, len(wanted), self._records)
-        self._environments = Environments(simulator, suite, config, self._write_conditions)
-        self._recorders = make_recorders(config, suite, simulator, store)
+        self._owns_environments = environments is None
+        self._environments = environments or Environments(simulator, suite, config, self._write_conditions)
+        self._recorders = [*make_recorders(config, suite, simulator, store), *recorders]
         self._number = self._failures = self._verdicts = self._errors_in_a_row = 0
         self._refill_share = _SHARE_TO_REFILL.get(config.backend, _GPU_SHARE)
 
@@ -152,8 +158,9 @@ class EpisodeLoop:
                 return
 
     def close(self) -> None:
-        """Close the environment and whatever watches it."""
-        self._environments.close()
+        """Close the environment, if it is the loop's own, and whatever watches it."""
+        if self._owns_environments:
+            self._environments.close()
         for recorder in self._recorders:
             recorder.close()
 

@@ -7,6 +7,7 @@ import importlib.util
 # Module, as it is imported -> the extra that has its package.
 EXTRAS = {
     "av": "render",
+    "fastapi": "serve",
     "h5py": "eval",
     "httpx": "simpler",
     "jinja2": "eval",
@@ -24,6 +25,7 @@ EXTRAS = {
     "tensorboardX": "tensorboard",
     "trackio": "trackio",
     "trimesh": "simpler",
+    "uvicorn": "serve",
     "wandb": "wandb",
     "warp": "warp",
     "websockets": "clients",

@@ -1,0 +1,169 @@
+"""``vecenv serve``: a live batch of environments in the browser, and over HTTP.
+
+Options as those of ``vecenv eval`` say what is built at first; the address is printed, and the server runs until Ctrl-C
+or SIGTERM. Episodes that have ended by then are in the results folder. The exit status is 2 when the arguments are
+wrong and 1 when the server cannot listen.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from vecenv.cli import fail
+from vecenv.util.extras import how_to_install, is_installed
+from vecenv.util.logs import Saying, reported, to_stderr
+from vecenv_eval.cli.options import some_settings, user_errors, with_settings
+from vecenv_eval.config import EvalConfig
+
+if TYPE_CHECKING:
+    from vecenv_eval.web.settings import ServeSettings
+
+# Settings of an evaluation that the command has.
+SETTINGS = (
+    "suite",
+    "policy",
+    "tasks",
+    "episodes",
+    "policy_args",
+    "protocol",
+    "backend",
+    "max_steps",
+    "seed",
+    "image_size",
+    "lod",
+    "colors",
+    "cameras",
+    "env_args",
+    "num_envs",
+    "num_threads",
+)
+_SHOWN = {"suite": "none: clients choose", "tasks": "0", "episodes": "the first", "num_envs": "--max-slots"}
+_HELPS = {
+    "suite": "Suite to begin with; `vecenv list` names them.",
+    "policy": "Policy to begin with, as of `vecenv eval`.",
+    "tasks": "Tasks to begin with: all, or indices, ranges, names and patterns.",
+    "episodes": "Episodes of each to begin with: all, a count, or indices and ranges.",
+    "num_envs": "Slots to begin with.",
+}
+
+
+def _serve(
+    config: Path | None = typer.Option(None, help="YAML file of settings, as of `vecenv eval`; options override it."),
+    out: Path | None = typer.Option(
+        None, help="Folder below which every run gets a results folder.", show_default="results are not kept"
+    ),
+    host: str = typer.Option("127.0.0.1", help="Address to listen on; others than loopback need a token."),
+    port: int = typer.Option(8321, min=0, max=65535, help="TCP port; 0 for a free one, which is printed."),
+    token_file: Path | None = typer.Option(
+        None,
+        help="File with the token that clients must show; also from VECENV_TOKEN. Loopback needs none, and for other "
+        "addresses one is made and printed.",
+        show_default="none",
+    ),
+    open_browser: bool = typer.Option(True, "--open/--no-open", help="Open the page in a browser."),
+    play: bool = typer.Option(False, "--play", help="Play at once."),
+    trust_clients: bool = typer.Option(
+        False,
+        "--trust-clients",
+        help="Clients may name module:Class policies, policy servers, language models and files: they can run any code "
+        "as you.",
+    ),
+    max_slots: int = typer.Option(64, min=1, max=4096, help="Most slots of a batch that a client builds."),
+    allow_host: list[str] = typer.Option([], help="A further name that the server is called by; repeatable."),
+    allow_origin: list[str] = typer.Option([], help="A further origin whose pages may call; repeatable."),
+    access_log: bool = typer.Option(False, "--access-log", help="Print a line for every request."),
+    **settings: Any,
+) -> None:
+    """Drive and watch a live batch of environments in the browser."""
+    for module in ("fastapi", "uvicorn", "PIL"):
+        if not is_installed(module):
+            fail(how_to_install(module), code=1)
+    sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
+    with user_errors():
+        first = _first(settings, config)
+        served = _settings(host, token_file, trust_clients, max_slots, allow_host, allow_origin)
+        _run(first, served, out, port, open_browser=open_browser, play=play, access_log=access_log)
+
+
+def _first(settings: dict[str, Any], file: Path | None) -> EvalConfig | None:
+    """What is built at first; None without a suite."""
+    given = some_settings(settings, file, SETTINGS, "serve")
+    if not given.get("suite"):
+        if given:
+            fail(f"--suite is needed with {', '.join(given)}; `vecenv list` names the suites")
+        return None
+    return EvalConfig.from_dict({"tasks": "0", "episodes": "0-0", **given})
+
+
+def _settings(
+    host: str, token_file: Path | None, trust: bool, max_slots: int, hosts: list[str], origins: list[str]
+) -> ServeSettings:
+    """Settings of the server; a token is made where one is needed and none was given."""
+    from vecenv_eval.web.settings import ServeSettings, is_loopback, new_token, read_token
+
+    token = read_token(token_file)
+    if token is None and not is_loopback(host):
+        token = new_token()
+        typer.echo(f"token: {token}", err=True)
+    return ServeSettings(
+        host=host,
+        token=token,
+        allowed_hosts=tuple(hosts),
+        allowed_origins=tuple(origins),
+        trust_clients=trust,
+        max_slots=max_slots,
+    )
+
+
+def _run(
+    first: EvalConfig | None,
+    settings: ServeSettings,
+    out: Path | None,
+    port: int,
+    *,
+    open_browser: bool,
+    play: bool,
+    access_log: bool,
+) -> None:
+    from vecenv_eval.panel.session import Session, check_live
+    from vecenv_eval.web.app import create_app
+    from vecenv_eval.web.server import Server
+
+    if first is not None:
+        check_live(first)
+    # A shell that starts it in the background makes it deaf to Ctrl-C's signal; `kill -INT` must still stop it. After
+    # SIGTERM too the session is closed, and what has ended summarised.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    if access_log:
+        logger = logging.getLogger("vecenv_eval.web.access")
+        logger.setLevel(logging.INFO)
+        logger.addHandler(Saying(to_stderr))
+    with (
+        suppress(KeyboardInterrupt),
+        reported(),
+        Session(first, out=out, max_slots=settings.max_slots, play=play) as session,
+    ):
+        server = Server(create_app(session, settings), port)
+
+        def started() -> None:
+            typer.echo(f"serving on {server.url}" + (" (the page asks for the token)" if settings.token else ""))
+            sys.stdout.flush()
+            if open_browser:
+                import webbrowser
+
+                webbrowser.open(server.url)
+
+        server.on_start(started)
+        server.run()  # uvicorn raises the signal again when it has stopped
+    typer.echo("stopped")
+
+
+serve_command = with_settings(_serve, SETTINGS, shown=_SHOWN, helps=_HELPS)
