@@ -47,7 +47,7 @@ from vecenv_eval.web.runs import Leg, RunReader, Snapshot
 
 # Seconds between two looks for a reader of the stream.
 _LOOK_S = 0.5
-_MOST_ROWS = 200
+_MOST_ROWS, _MOST_STREAMS = 200, 64
 _QUALITY = 85
 # How lists begin: what needs a look.
 _WORST_FIRST = {"error": 0, "fault": 1, "failure": 2, "success": 3}
@@ -66,9 +66,14 @@ class Runs:
 
     Args:
         sources: the runs.
+        drives: the server drives a session too.
+
+    Attributes:
+        streams: how many readers there are of the stream.
     """
 
-    def __init__(self, sources: Sequence[RunReader]) -> None:
+    def __init__(self, sources: Sequence[RunReader], drives: bool = False) -> None:
+        self.drives, self.streams = drives, 0
         self.readers = {source.name: source for source in sources}
         self.recordings, self.redrawer = Recordings(), Redrawer()
 
@@ -132,13 +137,14 @@ class Runs:
         return _jpeg(self.redrawer.frame(demo, tick, camera), size)
 
 
-def runs_router(sources: Sequence[RunReader]) -> APIRouter:
+def runs_router(sources: Sequence[RunReader], *, drives: bool = False) -> APIRouter:
     """The routes below ``/api/runs``.
 
     Args:
         sources: the runs that were opened (``vecenv_eval.web.runs.open_runs``).
+        drives: the server drives a session too, which the page then has a link to.
     """
-    runs = Runs(sources)
+    runs = Runs(sources, drives)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -166,7 +172,8 @@ def _add_lists(router: APIRouter, runs: Runs) -> None:
             runs=[
                 RunRow(run=info.name, folder=clean(str(info.folder)), state=runs.state(info, live_frames(info)))
                 for info in infos
-            ]
+            ],
+            drives=runs.drives,
         )
 
     @router.get("/{run}")
@@ -384,16 +391,21 @@ def _jpeg(image: np.ndarray, size: int) -> bytes:
 async def _stream(socket: WebSocket, runs: Runs, run: str) -> None:
     """Send what changes until the reader goes: looks wait while it is slow, so that it gets the newest and no queue."""
     await socket.accept()
+    if runs.streams >= _MOST_STREAMS:
+        await socket.close(1013, f"the server has {_MOST_STREAMS} readers already")
+        return
     try:
         await run_in_threadpool(runs.snapshot, run)
     except VecenvError as error:
-        await socket.close(1008, str(error)[:120])
+        await socket.close(1008, str(error)[:100])
         return
+    runs.streams += 1
     gone = asyncio.create_task(_until_gone(socket))
     sender = asyncio.create_task(_send_changes(socket, runs, run))
     try:
         await asyncio.wait((gone, sender), return_when=asyncio.FIRST_COMPLETED)
     finally:
+        runs.streams -= 1
         for task in (gone, sender):
             task.cancel()
         await asyncio.gather(gone, sender, return_exceptions=True)

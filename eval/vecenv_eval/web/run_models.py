@@ -27,9 +27,10 @@ class RunRow(BaseModel):
 
 
 class RunList(BaseModel):
-    """The runs that were opened, in the order in which they were named."""
+    """The runs that were opened, in the order in which they were named; ``drives``: the server drives a session too."""
 
     runs: list[RunRow]
+    drives: bool
 
 
 class Counts(BaseModel):

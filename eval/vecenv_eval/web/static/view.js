@@ -143,7 +143,9 @@ by("login-form").addEventListener("submit", async (event) => {
 
 async function begin() {
   try {
-    const opened = (await get("/api/runs")).runs.slice(0, 2);
+    const answer = await get("/api/runs");
+    by("drive").hidden = !answer.drives;
+    const opened = answer.runs.slice(0, 2);
     if (!opened.length) {
       complain(new Error("No run was opened: vecenv view DIR opens one."));
       return;
