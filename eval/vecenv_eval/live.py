@@ -3,8 +3,8 @@
 :class:`LivePublisher` is an episode recorder (``vecenv_eval.watch``): at most once a second it draws some of the running
 slots and publishes one frame, a JSON header and a JPEG mosaic of up to 64 slots. A process has one file,
 ``DIR/live/HOST-PID.frame``, which is replaced in one step and never synced. It is bounded (one file a process, no larger
-than a mosaic) and cheap: drawing takes at most a twentieth of the time. It never costs an episode: what goes wrong is
-logged once, and nothing more is published. ``vecenv eval --live`` asks for it; the files go when the run ends.
+than a mosaic) and cheap: making frames takes at most a tenth of the time, because as many slots are drawn for each as
+fit into that; they take turns. It never costs an episode: what goes wrong is logged once, and nothing more is published. ``vecenv eval --live`` asks for it; the files go when the run ends.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from vecenv_eval.watch import Observable
 LIVE, ENDING = "live", ".frame"
 # Side of a tile in pixels, and tiles in a row.
 TILE, COLUMNS = 96, 8
-# Most slots in a mosaic, and most that are drawn anew for one frame; they take turns.
-MOST_SLOTS, DRAWN_AT_ONCE = 64, 8
+# Most slots in a mosaic, and how many are drawn for the first frame, which tells what drawing costs.
+MOST_SLOTS, DRAWN_FIRST = 64, 8
 # Seconds between two frames at least, and the share of the time that making them may take.
-PERIOD_S, SHARE = 1.0, 0.05
+PERIOD_S, SHARE = 1.0, 0.1
 # Longest file that a reader takes.
 MOST_BYTES = 4_000_000
 _QUALITY = 75
@@ -141,6 +141,7 @@ class LivePublisher:
         self._mosaic = np.zeros((0, 0, 3), np.uint8)
         self._due, self._number, self._turn = clock(), 0, 0
         self._draws = self._works = True
+        self._drawn_at_once, self._drawn = DRAWN_FIRST, 0
         self._steps, self._counted_since = 0, clock()
 
     def begin(self, env: BatchEnv, episodes: Mapping[int, Episode]) -> None:
@@ -186,8 +187,14 @@ class LivePublisher:
             _log.warning("--live: no images are shown: %s: %s", type(error).__name__, " ".join(str(error).split()))
         self._tell(pack(self._header(), self._jpeg()))
         cost = self._clock() - began
-        # The first frame pays for the renderer, which is made once.
-        self._due = began + max(PERIOD_S, cost / SHARE if self._number > 1 else 0)
+        self._due = began + PERIOD_S
+        if self._number == 1:  # it paid for the renderer, which is made once
+            self._drawn_at_once = 1
+            return
+        self._due = began + max(PERIOD_S, cost / SHARE)
+        if self._drawn:
+            fitting = int(SHARE * PERIOD_S * self._drawn / max(cost, 1e-6))
+            self._drawn_at_once = max(1, min(fitting, 2 * self._drawn_at_once, MOST_SLOTS))
 
     def _draw(self, live: Sequence[int]) -> None:
         """Draw the next of the live slots into the mosaic."""
@@ -195,7 +202,8 @@ class LivePublisher:
 
         assert self._env is not None
         later = [slot for slot in live if slot >= self._turn]
-        chosen = (later + [slot for slot in live if slot < self._turn])[:DRAWN_AT_ONCE]
+        chosen = (later + [slot for slot in live if slot < self._turn])[: self._drawn_at_once]
+        self._drawn = len(chosen)
         if not chosen:
             return
         self._turn = chosen[-1] + 1

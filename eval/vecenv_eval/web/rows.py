@@ -29,6 +29,8 @@ MOST_ROWS, MOST_LINE, MOST_NUMBER = 1_000_000, 1_000_000, 10**9
 _CHUNK, _DEEPEST = 1 << 22, 16
 # Seconds that a look at a database may take.
 _LONGEST_S = 5.0
+# Seconds within which a writer has synced what it has written.
+_SETTLES_S = 5.0
 _RECORD = TypeAdapter(Record)
 
 
@@ -50,6 +52,7 @@ class RowReader:
         self._bad, self._first_bad = 0, ""
         self._place, self._lines, self._file = 0, 0, (0, 0)
         self._seen: tuple[Any, ...] = ()
+        self._seen_since, self._rows = 0.0, list[tuple[Any, ...]]()
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -126,13 +129,22 @@ class RowReader:
     # -- database ----------------------------------------------------------------------------------------------------
 
     def _read_database(self, path: Path) -> bool:
-        """Read all rows if the database has changed; rows are replaced in place, so there is no reading on."""
-        seen = tuple(_stamp(path.with_name(path.name + ending)) for ending in ("", "-wal"))
-        if seen == self._seen:
+        """Read all rows if the database may have changed; rows are replaced in place, so there is no reading on.
+
+        A row may be in the file for a while before readers see it, until the writer has synced it: a file that has just
+        changed is read again.
+        """
+        seen, now = tuple(_stamp(path.with_name(path.name + ending)) for ending in ("", "-wal")), time.monotonic()
+        if seen == self._seen and now > self._seen_since + _SETTLES_S:
             return False
         rows = _database_rows(path)
+        if seen != self._seen:
+            self._seen, self._seen_since = seen, now
+            self.changed = max(stamp[1] for stamp in seen) / 1e9
+        if rows == self._rows:
+            return False
         self._begin_again()
-        self._seen, self.changed = seen, max(stamp[1] for stamp in seen) / 1e9
+        self._rows = rows
         for number, values in enumerate(rows, start=1):
             self._add(_from_columns(values), f"row {number} of {DATABASE}")
         return True

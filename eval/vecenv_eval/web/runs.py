@@ -203,6 +203,12 @@ class _Plan:
     episodes: frozenset[Episode]
     instructions: Mapping[int, str]
 
+    def joined(self, other: _Plan) -> _Plan:
+        """What both ask for."""
+        return replace(
+            self, episodes=self.episodes | other.episodes, instructions={**self.instructions, **other.instructions}
+        )
+
 
 @dataclass(kw_only=True)
 class _Found:
@@ -371,7 +377,7 @@ class RunReader:
             part = self._planned[text]
             if part is None:
                 return None
-            whole = part if whole is None else replace(part, episodes=whole.episodes | part.episodes)
+            whole = part if whole is None else whole.joined(part)
         return whole
 
 
