@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from vecenv.errors import InvalidFile, NotFound
+from vecenv.errors import InvalidInput, NotFound
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store import ResultStore, log_path
@@ -35,7 +35,7 @@ _KEPT = 8
 _Value = TypeVar("_Value")
 
 
-class Unreadable(InvalidFile):
+class Unreadable(InvalidInput):
     """A recording that cannot be used; the message says why."""
 
 
@@ -171,7 +171,7 @@ def _video_facts(path: Path, cameras: Sequence[str]) -> VideoFacts:
             frames, rate = stream.frames, stream.average_rate
             width, height = stream.width, stream.height
     except (av.FFmpegError, IndexError, ValueError, OSError) as error:
-        raise Unreadable(f"{path.name} cannot be played: {' '.join(str(error).split())[:200]}") from None
+        raise Unreadable(_sentence(path, error)) from None
     if not (frames and rate and width and height):
         raise Unreadable(f"{path.name} cannot be played: it holds no frames")
     # Images are square and of one size unless a camera was left out; then nobody knows which is which.
@@ -179,6 +179,11 @@ def _video_facts(path: Path, cameras: Sequence[str]) -> VideoFacts:
     return VideoFacts(
         path=path, frames=frames, fps=float(rate), width=width, height=height, cameras=tuple(cameras) if known else ()
     )
+
+
+def _sentence(path: Path, error: Exception) -> str:
+    reason = " ".join(str(error).split()).replace(str(path), path.name)
+    return f"{path.name} cannot be played: {reason[:200]}"
 
 
 def video_frame(video: VideoFacts, tick: int, camera: str = WHOLE) -> np.ndarray:
@@ -215,7 +220,7 @@ def _decoded(video: VideoFacts, number: int) -> np.ndarray:
             if last is not None:
                 return last.to_ndarray(format="rgb24")
     except (av.FFmpegError, ValueError, OSError) as error:
-        raise Unreadable(f"{video.path.name} cannot be played: {' '.join(str(error).split())[:200]}") from None
+        raise Unreadable(_sentence(video.path, error)) from None
     raise Unreadable(f"{video.path.name} has no frame {number}")
 
 
