@@ -19,6 +19,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from vecenv.errors import InvalidFile
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store import DATABASE, EPISODES, Record
 from vecenv_eval.store.record import from_plain
@@ -150,7 +151,7 @@ class RowReader:
         return True
 
 
-class UnsafePath(Exception):
+class UnsafePath(InvalidFile):
     """A name that leads out of the folder, or is no ordinary file."""
 
 
