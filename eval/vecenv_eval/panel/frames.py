@@ -75,6 +75,13 @@ class FrameHub:
     Args:
         monitor: the table of the batch.
         wake: called when something was asked for, so that an environment that waits is drawn.
+
+    Attributes:
+        error: why nothing can be drawn, None while it can.
+        preparing: the first image is being drawn, which takes seconds in LIBERO, because a visual scene is compiled.
+        cameras: names of the cameras.
+        image_size: height and width of the images, pixels; None before the first.
+        drawn, encoded: images so far.
     """
 
     def __init__(self, monitor: Monitor, wake: Callable[[], None]) -> None:
@@ -87,6 +94,7 @@ class FrameHub:
 
     def _clear(self) -> None:
         self.error: str | None = None
+        self.preparing = self._has_drawn = False
         self.cameras: tuple[str, ...] = ()
         self.image_size: tuple[int, int] | None = None
         self._wanted: dict[Key, None] = {}
@@ -161,6 +169,7 @@ class FrameHub:
             keys = [key for key in self._wanted if only is None or key == WALL or _slot(key) in only]
             for key in keys:
                 del self._wanted[key]
+        self.preparing = keys != [] and not self._has_drawn
         try:
             views = [key for key in keys if isinstance(key, View) and self._is_stale(key)]
             if views:
@@ -170,6 +179,7 @@ class FrameHub:
         except Exception as error:  # no GL, no memory: the run goes on without images
             _log.warning("images cannot be drawn: %s", raised(error))
             self.error = f"images cannot be drawn: {raised(error)}"
+        self.preparing, self._has_drawn = False, self._has_drawn or keys != []
         now = time.monotonic()
         self._not_before = now + _REST * (now - began)
 

@@ -38,7 +38,16 @@ from vecenv_eval.panel import catalog
 from vecenv_eval.panel.batch import LiveBatch
 from vecenv_eval.panel.frames import FrameHub
 from vecenv_eval.panel.monitor import Monitor
-from vecenv_eval.panel.state import Fields, History, SessionClosed, SessionError, SessionState, StateName
+from vecenv_eval.panel.state import (
+    Fields,
+    History,
+    OutOfTurn,
+    SessionClosed,
+    SessionError,
+    SessionState,
+    StateName,
+    UnknownSlot,
+)
 from vecenv_eval.policies import raised
 from vecenv_eval.results import Progress
 from vecenv_eval.runner import check
@@ -150,8 +159,9 @@ class Session:
     def state(self, slot: int = 0) -> SessionState:
         """The session as it is now; ``planning`` is of ``slot``."""
         with self._cond:
-            batch, config = self._batch, self._config
-            slots = self._monitor.slots()
+            building = self._name == "building"
+            batch, config = None if building else self._batch, self._config
+            slots = () if building else self._monitor.slots()
             planned, finished, successes, errors = self._counts
             return SessionState(
                 state=self._name,
@@ -173,6 +183,7 @@ class Session:
                 planning=batch.plans.of(slot, self._monitor.instruction(slot)) if batch and slots else None,
                 cameras=self.frames.cameras,
                 image_size=self.frames.image_size,
+                preparing_images=self.frames.preparing,
                 results=batch.results if batch else None,
                 revision=sum(self.version),
             )
@@ -181,11 +192,11 @@ class Session:
         """The columns of the episode that a slot runs, or ran last.
 
         Raises:
-            SessionError: there is no such slot.
+            UnknownSlot: there is no such slot.
         """
         found = self._monitor.history(slot)
         if found is None:
-            raise SessionError(f"there is no slot {slot} in this session")
+            raise UnknownSlot(f"there is no slot {slot} in this session")
         return found
 
     def build(self, config: EvalConfig) -> None:
@@ -200,6 +211,7 @@ class Session:
         with self._cond:
             self._check_open()
             self._order, self._playing, self._budget = config, False, 0
+            self._config, self._counts = config, (0, 0, 0, 0)
             self._select(config)
             self._set("building", None)
 
@@ -214,7 +226,8 @@ class Session:
             SessionError: there is no such field, suite, task or episode, or no suite was chosen yet.
         """
         fields = self._chosen({"split": "suite", "task_id": "task", "episode_index": "episode"}.get(name, name), value)
-        assert fields.suite is not None and fields.task is not None
+        assert fields.suite is not None
+        assert fields.task is not None
         index = catalog.task_index(fields.suite, fields.task)
         self.build(self.config_of(fields.suite, tasks=str(index), episodes=f"{fields.episode}-{fields.episode}"))
         return fields
@@ -254,14 +267,14 @@ class Session:
             ``"run_start"`` if a run began, ``"episode_reset"`` if the episodes were put back to their start.
 
         Raises:
-            SessionError: nothing is built.
+            OutOfTurn: nothing is built.
             SessionClosed: the session was closed.
         """
         with self._cond:
             self._check_open()
             if self._name not in _BUILT:
                 why = {"building": "it is being built", "error": f"it failed: {self._error}"}.get(self._name)
-                raise SessionError(f"the session cannot {action}: {why or 'nothing is built yet'}")
+                raise OutOfTurn(f"the session cannot {action}: {why or 'nothing is built yet'}")
             begins = self._name in ("ready", "finished") and action in ("play", "step")
             if action == "play":
                 self._playing, self._budget = True, 0
@@ -375,7 +388,7 @@ class Session:
         if field not in ("task", "episode"):
             raise SessionError(f"there is no field {field!r}: suite, task or episode")
         if now.suite is None:
-            raise SessionError("choose a suite first")
+            raise OutOfTurn("choose a suite first")
         rows = catalog.tasks(now.suite)
         if field == "task":
             return Fields(suite=now.suite, task=rows[catalog.task_index(now.suite, value)].task, episode=0)
@@ -432,7 +445,6 @@ class Session:
     def _build(self, config: EvalConfig) -> None:
         self._drop_batch()
         with self._cond:
-            self._config = config
             self._set("building", None)
         limit = config.num_envs or self._max_slots
         self._batch = LiveBatch(replace(config, num_envs=limit), self._simulator)

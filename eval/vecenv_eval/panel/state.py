@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vecenv.errors import InvalidInput, SimulationError
+from vecenv.errors import InvalidInput, NotFound, SimulationError
 
 # "idle": nothing was built. "building": an environment and a policy are made, or episodes are placed. "ready": episodes
 # are at their start. "playing", "paused": a run goes on, or waits. "finished": it has ended or was stopped. "error":
@@ -19,7 +19,15 @@ Verdict = Literal["live", "success", "failure", "fault"]
 
 
 class SessionError(InvalidInput):
-    """A live session cannot do what was asked in its present state; the message says why."""
+    """A live session was asked for something that does not exist or that it cannot do; the message says why."""
+
+
+class OutOfTurn(SessionError):
+    """It cannot do that in its present state."""
+
+
+class UnknownSlot(NotFound):
+    """There is no such slot."""
 
 
 class SessionClosed(SimulationError):
@@ -70,7 +78,7 @@ class SlotState:
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint:
-    """A stop of the hand: position, metres, and rotation, wxyz, in the world frame; whether the grip is closed there."""
+    """A stop of the hand: position (metres) and rotation (wxyz), world frame; whether the grip is closed there."""
 
     pos: tuple[float, float, float]
     quat: tuple[float, float, float, float]
@@ -139,6 +147,7 @@ class SessionState:
         planning: of the slot that is looked at; None where the policy plans nothing.
         cameras: names of the cameras that can be watched; empty where nothing is drawn.
         image_size: height and width of their images, pixels; None before the first was drawn.
+        preparing_images: the first image of a scene is being drawn: nothing else happens for some seconds.
         results: name of the results folder that the run is written to; None without one.
         revision: larger whenever something in the scene or here has changed.
     """
@@ -165,6 +174,7 @@ class SessionState:
     planning: Planning | None = None
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] | None = None
+    preparing_images: bool = False
     results: str | None = None
     revision: int = 0
 

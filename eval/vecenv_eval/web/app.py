@@ -43,7 +43,7 @@ _PAGES = {"/": "index.html", "/view": "view.html"}
 
 def create_app(
     session: Session | None = None,
-    settings: ServeSettings = ServeSettings(),
+    settings: ServeSettings | None = None,
     *,
     routers: Sequence[APIRouter] = (),
     static: Path = STATIC,
@@ -52,10 +52,11 @@ def create_app(
 
     Args:
         session: what is driven; None serves no session (its routes are not there).
-        settings: security and limits.
+        settings: security and limits; loopback without a token when not given.
         routers: further routes, such as those of ``vecenv view``.
         static: folder of the page's files.
     """
+    settings = settings or ServeSettings()
     context = Context(session, settings)
 
     @asynccontextmanager

@@ -10,6 +10,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from vecenv.errors import InvalidInput, NotFound, VecenvError
+from vecenv_eval.panel.state import OutOfTurn
 
 _log = logging.getLogger(__name__)
 _SENTENCES = {404: "there is nothing at this address", 405: "this address does not take that method"}
@@ -56,7 +57,8 @@ async def _http(request: Request, error: Exception) -> JSONResponse:
 
 
 async def _known(request: Request, error: Exception) -> JSONResponse:
-    status = 404 if isinstance(error, NotFound) else 422 if isinstance(error, InvalidInput) else 503
+    kinds = ((OutOfTurn, 409), (NotFound, 404), (InvalidInput, 422))
+    status = next((code for kind, code in kinds if isinstance(error, kind)), 503)
     return JSONResponse(error_body(str(error)), status)
 
 

@@ -175,10 +175,11 @@ class StreamMessage(Body):
 
 
 class NodeBody(Body):
-    """Inputs of a node by port, and its config."""
+    """Inputs of a node by port, and its config; ``node`` tells several nodes of a graph with the same type apart."""
 
     inputs: dict[str, Any] = Field(default_factory=dict)
     config: dict[str, Any] = Field(default_factory=dict)
+    node: Annotated[str, StringConstraints(max_length=64)] = ""
 
 
 class NodeAnswer(BaseModel):
@@ -201,13 +202,53 @@ class NodeRow(BaseModel):
 
     node_type: str
     node_set: str
+    display_name: str
     description: str
     inputs: list[PortRow]
     outputs: list[PortRow]
     config: dict[str, Any]
 
 
+class NodeSetRow(BaseModel):
+    """A node set; one with a panel has environments, whose episodes the panel chooses."""
+
+    name: str
+    display_name: str
+    has_panel: bool
+
+
 class NodeCatalog(BaseModel):
-    """Every node."""
+    """Every node and node set."""
 
     nodes: list[NodeRow]
+    sets: list[NodeSetRow]
+
+
+class PanelFields(BaseModel):
+    """The fields of a node set's panel: name, value, default, and options with labels."""
+
+    fields: list[dict[str, Any]]
+
+
+class PanelField(Body):
+    """A choice in a node set's panel."""
+
+    name: Name
+    value: Annotated[int, Field(ge=0, le=2**31 - 1)] | Name
+
+
+class PanelAction(Body):
+    """An action of a node set's panel."""
+
+    action: Literal["play", "pause", "stop", "reset"]
+
+
+class PanelAnswer(BaseModel):
+    """A node set's panel after a choice or an action."""
+
+    state: str
+    fields: dict[str, str | int]
+    signal_name: str | None = None
+    snapshot: dict[str, str | int] | None = None
+    run_start: bool = False
+    step_budget: int | None = None

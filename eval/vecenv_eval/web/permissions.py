@@ -41,6 +41,8 @@ ENV_ARGS = (
 )
 _RENDER_ARGS = ("colors", "height", "lod", "width")
 _LONGEST_TEXT, _LARGEST_NUMBER, _LARGEST_IMAGE = 64, 100_000, 1024
+# Names of what writes programs without being asked over a network.
+_RULE_BASES = "offline/"
 _HOW = "start the server with --trust-clients to allow it"
 
 
@@ -65,6 +67,21 @@ def check_request(body: SessionBody, settings: ServeSettings, base: EvalConfig |
     elif body.policy_args:
         raise Refused(422, "policy_args without a policy: name the policy that they are for", "policy_args")
     _check_values("env_args", body.env_args, ENV_ARGS)
+
+
+def check_node_config(config: Mapping[str, Any], settings: ServeSettings) -> None:
+    """Refuse a node's config that names a language model, or options that go past its schema.
+
+    Raises:
+        Refused: clients may not give that.
+    """
+    if settings.trust_clients:
+        return
+    model = config.get("model")
+    if isinstance(model, str) and not model.startswith(_RULE_BASES):
+        raise Refused(403, f"config: clients may not name a language model; {_HOW}", "config")
+    if config.get("options"):
+        raise Refused(403, f"config: options are not open to clients; {_HOW}", "config")
 
 
 def _check_policy(name: str, arguments: Mapping[str, Any], named: str | None, base: EvalConfig | None) -> None:
@@ -102,4 +119,4 @@ def _check_render(field: str, value: object) -> None:
 def _is_plain(value: object) -> bool:
     if isinstance(value, str):
         return len(value) <= _LONGEST_TEXT and value.replace("_", "").replace("-", "").isalnum()
-    return value is None or isinstance(value, bool | int | float) and abs(value) <= _LARGEST_NUMBER
+    return value is None or (isinstance(value, bool | int | float) and abs(value) <= _LARGEST_NUMBER)

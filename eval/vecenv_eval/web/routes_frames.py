@@ -76,7 +76,8 @@ class Broadcast:
     def stamp(self) -> tuple[object, ...]:
         """Changes whenever the state that readers get would."""
         held = self._context.writers.is_held(SESSION)
-        return (*self._session.version, held, self._context.url_3d, self._session.frames.error)
+        frames = self._session.frames
+        return (*self._session.version, held, self._context.url_3d, frames.error, frames.preparing)
 
     def text(self, slot: int, writer: str | None) -> str:
         """The state as a message; of one slot's plan."""

@@ -1,37 +1,53 @@
-"""Nodes over HTTP: what there is, and one call of one of them.
+"""Nodes over HTTP: what there is, one call of one of them, and the panels of node sets.
 
-The node sets of ``vecenv.interop.nodes`` and ``voxposer.nodes`` come in. A set is initialised at its first call and
-runs on one thread of its own, one call after the other. Arrays and images of the outputs become JSON (``plain``).
+The node sets of ``vecenv.interop.nodes`` and ``voxposer.nodes`` come in. The calls of a set wait for one another; a set
+has environments of its own, which the session does not see. Arrays and images of the outputs become JSON
+(:func:`plain`).
 """
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import importlib
-import inspect
 import io
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, is_dataclass
-from typing import Any
+from typing import Any, TypeVar
 
-import asyncio
 import numpy as np
 from fastapi import APIRouter
 from pydantic import BaseModel, ValidationError
 
 from vecenv_eval.web.context import Context
 from vecenv_eval.web.errors import Refused
-from vecenv_eval.web.models import ErrorBody, NodeAnswer, NodeBody, NodeCatalog, NodeRow, PortRow
+from vecenv_eval.web.models import (
+    ErrorBody,
+    NodeAnswer,
+    NodeBody,
+    NodeCatalog,
+    NodeRow,
+    NodeSetRow,
+    PanelAction,
+    PanelAnswer,
+    PanelField,
+    PanelFields,
+)
+from vecenv_eval.web.permissions import check_node_config
 from vecenv_eval.web.writer import WriterName
 
 # Where node sets come from; a package without them serves none.
 PACKAGES = ("vecenv.interop.nodes", "voxposer.nodes")
+# Calls of a set that may wait, and seconds that a set is given to shut down.
+_MOST_WAITING, _SHUTDOWN_S = 8, 10.0
+_CONFLICT = {409: {"model": ErrorBody}}
+_Result = TypeVar("_Result")
 
 
 class NodeHost:
-    """Node sets and the threads that they run on.
+    """Node sets and the threads that they are called on.
 
     Args:
         sets: the node sets by name; those of :data:`PACKAGES` when not given.
@@ -41,32 +57,32 @@ class NodeHost:
         self.sets = dict(installed_sets() if sets is None else sets)
         self.tools = {tool.node_type: (name, tool) for name, each in self.sets.items() for tool in each.get_tools()}
         self._threads: dict[str, ThreadPoolExecutor] = {}
-        self._ready: set[str] = set()
-        self._lock = threading.Lock()
+        self._waiting = dict.fromkeys(self.sets, 0)
 
-    async def run(self, node_type: str, inputs: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
-        """Call a node on its set's thread."""
-        name, tool = self.tools[node_type]
-        with self._lock:
-            thread = self._threads.setdefault(name, ThreadPoolExecutor(1, thread_name_prefix=f"vecenv-{name}"))
-        return await asyncio.get_running_loop().run_in_executor(thread, self._run, name, tool, inputs, config)
+    async def call(self, name: str, function: Callable[..., _Result], *arguments: Any) -> _Result:
+        """Call a function of a set on its thread.
 
-    def _run(self, name: str, tool: Any, inputs: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
-        if name not in self._ready:
-            self.sets[name].initialize()
-            self._ready.add(name)
-        outputs = tool.run(inputs, config)
-        return asyncio.run(outputs) if inspect.iscoroutine(outputs) else outputs
+        Raises:
+            Refused: too many calls of the set wait already.
+        """
+        if self._waiting[name] >= _MOST_WAITING:
+            raise Refused(503, f"{_MOST_WAITING} calls of {name} wait already", retry_after="1")
+        thread = self._threads.setdefault(name, ThreadPoolExecutor(1, thread_name_prefix=f"vecenv-{name}"))
+        self._waiting[name] += 1
+        try:
+            # A call goes on when its client has left: what it does to an environment is not half done.
+            return await asyncio.shield(asyncio.get_running_loop().run_in_executor(thread, function, *arguments))
+        finally:
+            self._waiting[name] -= 1
 
     def close(self) -> None:
-        """Shut down every set that was initialised, on its thread."""
-        with self._lock:
-            threads, self._threads = self._threads, {}
+        """Shut down every set that was called."""
+        threads, self._threads = self._threads, {}
         for name, thread in threads.items():
-            if name in self._ready:
-                thread.submit(self.sets[name].shutdown)
-            thread.shutdown(wait=True)
-        self._ready.clear()
+            thread.shutdown(wait=False, cancel_futures=True)
+            ending = threading.Thread(target=self.sets[name].shutdown, daemon=True, name=f"vecenv-{name}-end")
+            ending.start()
+            ending.join(_SHUTDOWN_S)
 
 
 def installed_sets() -> dict[str, Any]:
@@ -97,62 +113,77 @@ def nodes_router(context: Context, host: NodeHost | None = None) -> APIRouter:
     @router.get("/nodes")
     def catalog() -> NodeCatalog:
         """Every node with its ports and the schema of its config."""
-        return NodeCatalog(nodes=[_row(name, tool) for name, tool in nodes.tools.values()])
+        rows = [NodeRow(node_set=name, **_described(tool)) for name, tool in nodes.tools.values()]
+        sets = [
+            NodeSetRow(name=name, display_name=each.display_name, has_panel=each.panel is not None)
+            for name, each in nodes.sets.items()
+        ]
+        return NodeCatalog(nodes=rows, sets=sets)
 
-    @router.post("/nodes/{node_type}", responses={409: {"model": ErrorBody}})
+    @router.post("/nodes/{node_type}", responses=_CONFLICT)
     async def call(node_type: str, body: NodeBody, writer: WriterName = None) -> NodeAnswer:
-        """Call a node; what it could not do is its output ``error``."""
+        """Call a node; why it could not do something is its output ``error``."""
         if node_type not in nodes.tools:
             raise Refused(404, f"there is no node {node_type[:64]!r}: GET /api/nodes lists them", "node_type")
         name, tool = nodes.tools[node_type]
-        known = {port.name for port in _ports(tool.inputs)}
-        if stray := sorted(set(body.inputs) - known):
-            raise Refused(422, f"inputs: {node_type} has no port {stray[0][:64]!r}", "inputs")
-        config = _config_of(tool, body.config)
+        known = [port.name for port in tool.inputs]
+        if stray := [each for each in body.inputs if each not in known]:
+            raise Refused(422, f"inputs: {node_type} has no port {stray[0][:64]!r}: {', '.join(known)}", "inputs")
+        _check_config(tool.config, body.config)
+        check_node_config(body.config, context.settings)
         context.writers.claim(f"nodes/{name}", writer)
-        return NodeAnswer(outputs=plain(await nodes.run(node_type, body.inputs, config)))
+        outputs = await nodes.call(name, lambda: plain(tool.run(body.inputs, body.config, node=body.node)))
+        return NodeAnswer(outputs=outputs)
+
+    def panel_of(node_set: str) -> Any:
+        panel = nodes.sets[node_set].panel if node_set in nodes.sets else None
+        if panel is None:
+            raise Refused(404, f"there is no node set {node_set[:64]!r} with a panel", "node_set")
+        return panel
+
+    @router.get("/panels/{node_set}")
+    async def fields(node_set: str) -> PanelFields:
+        """The fields of a node set's panel, with what they offer."""
+        panel = panel_of(node_set)
+        return PanelFields(fields=[each.model_dump() for each in await nodes.call(node_set, panel.fields)])
+
+    @router.post("/panels/{node_set}/fields", responses=_CONFLICT)
+    async def choose(node_set: str, body: PanelField, writer: WriterName = None) -> PanelAnswer:
+        """Choose a value; the episode is placed."""
+        panel = panel_of(node_set)
+        context.writers.claim(f"nodes/{node_set}", writer)
+        return _answer(await nodes.call(node_set, panel.set_field, body.name, body.value))
+
+    @router.post("/panels/{node_set}/actions", responses=_CONFLICT)
+    async def act(node_set: str, body: PanelAction, writer: WriterName = None) -> PanelAnswer:
+        """Play, pause, stop or reset."""
+        panel = panel_of(node_set)
+        context.writers.claim(f"nodes/{node_set}", writer)
+        return _answer(await nodes.call(node_set, panel.action, body.action))
 
     return router
 
 
-def _config_of(tool: Any, given: dict[str, Any]) -> dict[str, Any]:
-    """A node's config, checked."""
-    model = tool.config
-    if not (isinstance(model, type) and issubclass(model, BaseModel)):
-        return given
+def _described(tool: Any) -> dict[str, Any]:
+    """A tool as a row of the catalogue."""
+    known = tool.describe()
+    return {name: known[name] for name in ("node_type", "display_name", "description", "inputs", "outputs", "config")}
+
+
+def _answer(response: Any) -> PanelAnswer:
+    """What a panel answers; what it could not do is refused."""
+    values = response.model_dump()
+    if error := values.pop("error", ""):
+        raise Refused(422, error)
+    return PanelAnswer(**values)
+
+
+def _check_config(model: type[BaseModel], given: dict[str, Any]) -> None:
     try:
         model.model_validate(given)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise Refused(422, f"config.{'.'.join(map(str, first['loc']))}: {first['msg']}", "config") from None
-    return given
-
-
-def _row(name: str, tool: Any) -> NodeRow:
-    model = tool.config
-    return NodeRow(
-        node_type=tool.node_type,
-        node_set=name,
-        description=(inspect.getdoc(type(tool)) or "").partition("\n")[0],
-        inputs=_ports(tool.inputs),
-        outputs=_ports(tool.outputs),
-        config=model.model_json_schema() if isinstance(model, type) and issubclass(model, BaseModel) else {},
-    )
-
-
-def _ports(ports: Mapping[str, Any] | Sequence[Any]) -> list[PortRow]:
-    """Ports as rows: objects with ``name`` and ``type``, or a mapping of names to types."""
-    if isinstance(ports, Mapping):
-        return [PortRow(name=name, type=str(kind)) for name, kind in ports.items()]
-    return [
-        PortRow(
-            name=port.name,
-            type=str(getattr(port, "wire_type", getattr(port, "type", ""))),
-            optional=bool(getattr(port, "optional", False)),
-            description=str(getattr(port, "description", "")),
-        )
-        for port in ports
-    ]
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise Refused(422, f"config.{'.'.join(map(str, first['loc']))[:80]}: {first['msg']}", "config") from None
 
 
 def plain(value: Any) -> Any:

@@ -61,6 +61,7 @@ class Server:
         self._socket = _listen(settings.host, port)
         self.port: int = self._socket.getsockname()[1]
         context: Context = app.state.context
+        self._context = context
         self._server = _Uvicorn(
             uvicorn.Config(
                 app,
@@ -85,6 +86,11 @@ class Server:
         """Where it is: ``"http://127.0.0.1:8000"``."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"http://{host}:{self.port}"
+
+    @property
+    def streams(self) -> int:
+        """Readers of the stream that are connected."""
+        return self._context.streams
 
     def run(self) -> None:
         """Serve until SIGINT or SIGTERM, in the main thread."""
