@@ -49,6 +49,7 @@ class World:
     limit: float | None = None
     bodies: list[Any] = field(default_factory=list)
     subscriptions: list[Any] = field(default_factory=list)
+    shown: list[int] = field(default_factory=list)
 
     def build(self, body: dict[str, Any]) -> None:
         first = int(body["episodes"].split("-")[0])
@@ -174,7 +175,10 @@ def wall(world: World, cache: dict[int, bytes]) -> bytes:
             top, left = slot // columns * TILE, slot % columns * TILE
             sheet[top : top + TILE, left : left + TILE] = picture(TILE, slot, 8 * phase)
         cache[phase] = jpeg(sheet)
-    verdicts = ["fault" if s["fault"] else "success" if s["success"] else "failure" if s["truncated"] else "live" for s in world.slots]
+    verdicts = [
+        "fault" if s["fault"] else "success" if s["success"] else "failure" if s["truncated"] else "live"
+        for s in world.slots
+    ]
     header = {
         "type": "wall",
         "tile": TILE,
@@ -218,14 +222,18 @@ def make_app(world: World) -> Any:
 
     @app.get("/api/catalog")
     def catalog() -> Any:
-        rows = [{"name": n, "family": f, "num_tasks": k, "label": f"{n} ({k} tasks)"} for n, (f, k, _) in SUITES.items()]
+        rows = [
+            {"name": n, "family": f, "num_tasks": k, "label": f"{n} ({k} tasks)"} for n, (f, k, _) in SUITES.items()
+        ]
         return {"suites": rows}
 
     @app.get("/api/catalog/{suite:path}")
     def tasks(suite: str) -> Any:
         _, count, episodes = SUITES[suite]
         words = [f"{world.instruction}, variant {i}" for i in range(count)]
-        return {"tasks": [{"task": i, "label": "", "instruction": w, "num_episodes": episodes} for i, w in enumerate(words)]}
+        return {
+            "tasks": [{"task": i, "label": "", "instruction": w, "num_episodes": episodes} for i, w in enumerate(words)]
+        }
 
     @app.get("/api/policies")
     def policies() -> Any:
@@ -253,6 +261,11 @@ def make_app(world: World) -> Any:
     @app.post("/api/panel/actions")
     def action(body: dict) -> Any:
         return {"state": world.state, "signal_name": world.act(body["action"], body.get("ticks", 1))}
+
+    @app.post("/api/view3d")
+    def view3d(body: dict) -> Any:
+        world.shown.append(body["slot"])
+        return {"ok": True}
 
     @app.delete("/api/writer")
     def release() -> Any:
@@ -282,7 +295,14 @@ def make_app(world: World) -> Any:
                         slot = wanted["slot"]
                         tick = world.slots[slot]["step"]
                         image = jpeg(picture(128, slot + 3 * (camera == "wrist"), tick))
-                        header = {"type": "frame", "slot": slot, "camera": camera, "tick": tick, "width": 128, "height": 128}
+                        header = {
+                            "type": "frame",
+                            "slot": slot,
+                            "camera": camera,
+                            "tick": tick,
+                            "width": 128,
+                            "height": 128,
+                        }
                         await socket.send_bytes(message(header, image))
                     if wanted["wall"] and world.slots:
                         if len(world.slots) != len(cache.get(-1, b"")):
@@ -311,7 +331,9 @@ def serving(app: Any, port: int) -> Iterator[str]:
     """The address of an application that runs on a port of this machine."""
     import uvicorn
 
-    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=port, log_level="error", timeout_graceful_shutdown=1))
+    server = uvicorn.Server(
+        uvicorn.Config(app, host="127.0.0.1", port=port, log_level="error", timeout_graceful_shutdown=1)
+    )
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     while not server.started:

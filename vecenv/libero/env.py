@@ -339,6 +339,10 @@ class LiberoEnv(SlotBatch):
             raise LiberoError("the environment is closed")
         return self._physics
 
+    def problem(self, slot: int) -> Problem:
+        """The parsed BDDL problem of a slot's task."""
+        return self._tasks[int(self._placement.task[slot])].problem
+
     @property
     def mj_models(self) -> tuple[mujoco.MjModel, ...]:
         """The compiled models, one a scene; ``scene_index`` says which slot uses which."""

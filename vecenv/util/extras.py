@@ -26,6 +26,7 @@ EXTRAS = {
     "trackio": "trackio",
     "trimesh": "simpler",
     "uvicorn": "serve",
+    "viser": "viser",
     "wandb": "wandb",
     "warp": "warp",
     "websockets": "clients",

@@ -79,6 +79,10 @@ def _serve(
     allow_host: list[str] = typer.Option([], help="A further name that the server is called by; repeatable."),
     allow_origin: list[str] = typer.Option([], help="A further origin whose pages may call; repeatable."),
     access_log: bool = typer.Option(False, "--access-log", help="Print a line for every request."),
+    view_3d: bool = typer.Option(
+        False, "--view-3d", help="Also serve a 3-D view, on a port of its own of this machine, without the token."
+    ),
+    port_3d: int = typer.Option(0, "--port-3d", min=0, max=65535, help="Port of the 3-D view; 0 for a free one."),
     **settings: Any,
 ) -> None:
     """Drive and watch a live batch of environments in the browser."""
@@ -89,7 +93,8 @@ def _serve(
     with user_errors():
         first = _first(settings, config)
         served = _settings(host, token_file, trust_clients, max_slots, allow_host, allow_origin)
-        _run(first, served, out, port, open_browser=open_browser, play=play, access_log=access_log)
+        ports = (port, port_3d if view_3d else None)
+        _run(first, served, out, ports, open_browser=open_browser, play=play, access_log=access_log)
 
 
 def _first(settings: dict[str, Any], file: Path | None) -> EvalConfig | None:
@@ -126,7 +131,7 @@ def _run(
     first: EvalConfig | None,
     settings: ServeSettings,
     out: Path | None,
-    port: int,
+    ports: tuple[int, int | None],
     *,
     open_browser: bool,
     play: bool,
@@ -151,7 +156,13 @@ def _run(
         reported(),
         Session(first, out=out, max_slots=settings.max_slots, play=play) as session,
     ):
-        server = Server(create_app(session, settings), port)
+        app = create_app(session, settings)
+        if ports[1] is not None:
+            from vecenv_eval.web.routes_view3d import attach_view3d
+            from vecenv_eval.web.scene3d import Scene3D
+
+            attach_view3d(app, session, Scene3D(ports[1]))
+        server = Server(app, ports[0])
 
         def started() -> None:
             typer.echo(f"serving on {server.url}" + (" (the page asks for the token)" if settings.token else ""))

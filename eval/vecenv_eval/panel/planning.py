@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -22,11 +23,15 @@ class Plans:
 
     Args:
         policy: the policy, not reset yet.
+
+    Attributes:
+        on_motion: called with every motion as it is planned, on the thread of the environment.
     """
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy if isinstance(policy, VoxPoserPolicy) else None
         self._lock = threading.Lock()
+        self.on_motion: Callable[[PlannedMotion], None] = lambda motion: None
         self._motions: dict[int, Planning] = {}
         self._tick = 0
         if self._policy is not None:
@@ -88,6 +93,7 @@ class Plans:
         )
         with self._lock:
             self._motions[motion.slot] = planning
+        self.on_motion(motion)
 
 
 def _spread(count: int) -> list[int]:

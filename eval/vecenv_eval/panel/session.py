@@ -52,6 +52,7 @@ from vecenv_eval.policies import raised
 from vecenv_eval.results import Progress
 from vecenv_eval.runner import check
 from vecenv_eval.simulator import Simulator, vecenv_simulator
+from voxposer.planned import PlannedMotion
 
 _log = logging.getLogger(__name__)
 Action = Literal["play", "pause", "step", "stop", "reset"]
@@ -78,6 +79,10 @@ class Observer(Protocol):
 
     def tick(self, env: BatchEnv) -> None:
         """A tick has happened, or the environment waits; called often, so be quick."""
+        ...
+
+    def planned(self, motion: PlannedMotion) -> None:
+        """VoxPoser has planned a motion."""
         ...
 
     def lost(self) -> None:
@@ -448,6 +453,7 @@ class Session:
             self._set("building", None)
         limit = config.num_envs or self._max_slots
         self._batch = LiveBatch(replace(config, num_envs=limit), self._simulator)
+        self._batch.plans.on_motion = lambda motion: self._tell("planned", motion)
         self._place(self._batch)
 
     def _place(self, batch: LiveBatch) -> None:

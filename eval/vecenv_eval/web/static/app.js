@@ -22,7 +22,7 @@ const SHOWN_FIRST = ["agentview", "wrist"];
 let state = { state: "connecting", slots: [], num_slots: 0, cameras: [] };
 let followed = 0;
 let cameras = null; // names the reader chose; null for the first ones
-let busy = false;
+const sending = new Set(); // requests that are not answered yet
 let connected = false;
 let problemOf = ""; // what the sentence that is shown is about
 let history = { slot: -1, step: -1, episode: "", running: false }; // what the plots show
@@ -37,7 +37,10 @@ const stream = new Stream({
   frame: (header, image) => views.take(header, image),
   wall: (header, image) => wall.take(header, image),
   problem: (sentence) => complain(sentence, "stream"),
-  up: connectedAgain,
+  up: () => {
+    stream.keep(WRITER);
+    return connectedAgain();
+  },
   down: disconnected,
 });
 
@@ -60,8 +63,9 @@ function announce(sentence) {
 
 /** Send what the reader asked for; a refusal is shown as the server says it. */
 async function send(path, body) {
-  if (busy) return null;
-  busy = true;
+  const key = `${path} ${body.action ?? ""}`; // the same one again waits for its answer, another one does not
+  if (sending.has(key)) return null;
+  sending.add(key);
   enable();
   try {
     const answer = await post(path, body);
@@ -72,7 +76,7 @@ async function send(path, body) {
     else complain(error.message, "request");
     return null;
   } finally {
-    busy = false;
+    sending.delete(key);
     enable();
   }
 }
@@ -134,8 +138,8 @@ function show(next) {
     views.clear();
     wall.clear();
   }
-  if (next.error) complain(next.error, "session");
-  else settle("session");
+  if (!next.error) settle("session");
+  else if (next.error !== before.error) complain(next.error, "session");
   subscribe();
   setup.follow(next).catch((error) => complain(error.message, "request"));
   render();
@@ -150,6 +154,7 @@ function render() {
   const other = state.writer_held && !state.writer ? "; driven by another client" : "";
   by("batch").textContent = state.suite ? `${state.suite}, tick ${state.tick}${other}` : "";
   by("running-policy").textContent = state.policy ?? "-";
+  by("preparing").hidden = !state.preparing_images;
   const count = state.slots.length;
   by("slot").max = Math.max(0, count - 1);
   if (document.activeElement !== by("slot")) by("slot").value = followed;
@@ -165,7 +170,7 @@ function render() {
   slots.show(state, followed);
   showPlan(state.planning, followed);
   document.querySelector(".all").classList.toggle("few", count < 2);
-  document.querySelector(".page").classList.toggle("empty", count === 0);
+  document.querySelector(".page").classList.toggle("empty", count === 0 && state.state !== "building");
   view3d();
   enable();
 }
@@ -173,13 +178,13 @@ function render() {
 function enable() {
   const is = state.state;
   const playing = is === "playing";
-  const loaded = connected && !busy && state.slots.length > 0 && is !== "building";
+  const loaded = connected && state.slots.length > 0 && is !== "building";
   const enabled = {
     play: loaded && is !== "error",
     step: loaded && !playing && is !== "error",
     stop: loaded && (playing || is === "paused"),
     reset: loaded,
-    load: connected && !busy && is !== "building",
+    load: connected && !sending.has("/api/session ") && is !== "building",
     slot: state.slots.length > 1,
   };
   for (const [id, on] of Object.entries(enabled)) {
@@ -196,7 +201,7 @@ const may = (id) => by(id).getAttribute("aria-disabled") !== "true";
 function cameraNames() {
   const there = state.cameras ?? [];
   const box = by("camera-names");
-  box.hidden = there.length < 3;
+  by("camera-choice").hidden = there.length < 2;
   const labels = there.map((name) => {
     const label = element("label", "", "check");
     const check = element("input");

@@ -69,6 +69,7 @@ export class Setup {
     this.policies = [];
     this.touched = false;
     this.asked = 0;
+    this.followed = null; // the suite that the form has taken over from the server
     by("suite").addEventListener("change", () => this.edited(() => this.suiteChanged()));
     by("task").addEventListener("change", () => this.edited(() => this.taskChanged()));
     for (const id of ["episode", "slots"]) by(id).addEventListener("input", () => this.edited(() => this.place()));
@@ -199,7 +200,10 @@ export class Setup {
 
   /** Show what the server runs, unless the reader is choosing something else. */
   async follow(state) {
-    if (this.touched || !state.suite || !this.suites.length) return;
+    // Only what stands at its start: in a run, slots go on to other episodes.
+    const begun = state.state !== "ready" && this.followed === state.suite;
+    if (this.touched || begun || !state.slots.length || !this.suites.length) return;
+    this.followed = state.suite;
     const changed = by("suite").value !== state.suite;
     this.select("suite", state.suite);
     if (changed) await this.suiteChanged();
@@ -208,8 +212,14 @@ export class Setup {
     this.taskChanged();
     this.select("episode", several ? Math.min(...state.slots.map((slot) => slot.episode)) : state.episode);
     if (state.num_slots) by("slots").value = state.num_slots;
-    this.select("policy", state.policy);
+    this.select("policy", this.policyOf(state.policy));
     this.describe();
     this.place();
+  }
+
+  /** The policy in the list that a running one is: a policy may add to its name, such as the model it asks. */
+  policyOf(running) {
+    const found = this.policies.map((each) => each.name).filter((name) => running?.startsWith(name));
+    return found.sort((a, b) => b.length - a.length)[0];
   }
 }

@@ -36,7 +36,8 @@ export class Slots {
   }
 
   one(slot) {
-    by("instruction").textContent = slot ? slot.instruction || "(no instruction)" : "No batch is loaded";
+    const none = this.state.state === "building" ? `Loading ${this.state.suite ?? ""}\u2026` : "No batch is loaded";
+    by("instruction").textContent = slot ? slot.instruction || "(no instruction)" : none;
     by("episode-id").textContent = slot ? slot.episode_id : "";
     by("steps").textContent = slot ? `${slot.step} of ${slot.max_steps} ticks` : "-";
     by("budget").max = slot?.max_steps || 1;

@@ -83,6 +83,7 @@ export class Wall {
       const began = performance.now();
       this.draw();
       this.drawMs = performance.now() - began;
+      this.canvas.dataset.drawMs = this.drawMs.toFixed(2);
     });
   }
 
