@@ -1,10 +1,10 @@
 """The newest images of running episodes, as small files that whoever looks at the results folder may read.
 
-:class:`LivePublisher` is an episode recorder (``vecenv_eval.watch``): at most once a second it draws some of the running
-slots and publishes one frame, a JSON header and a JPEG mosaic of up to 64 slots. A process has one file,
-``DIR/live/HOST-PID.frame``, which is replaced in one step and never synced. It is bounded (one file a process, no larger
-than a mosaic) and cheap: making frames takes at most a tenth of the time, because as many slots are drawn for each as
-fit into that; they take turns. It never costs an episode: what goes wrong is logged once, and nothing more is published. ``vecenv eval --live`` asks for it; the files go when the run ends.
+:class:`LivePublisher` is an episode recorder (``vecenv_eval.watch``): at most once a second it draws some of the
+running slots and publishes one frame, a JSON header and a JPEG mosaic of up to 64 slots. A process has one file,
+``DIR/live/HOST-PID.frame``, which is replaced in one step and never synced. Making frames takes at most a tenth of the
+time: as many slots are drawn for each as fit into that, and they take turns. It never costs an episode: what goes wrong
+is logged once. ``vecenv eval --live`` asks for it; the files go when the run ends.
 """
 
 from __future__ import annotations

@@ -115,7 +115,9 @@ def _read(path: Path, leg: str) -> LiveFrame | None:
         header = Header.model_validate(values)
     except (OSError, LiveError, ValidationError):
         return None
-    lengths = {len(each) for each in (header.slots, header.ticks, header.verdicts, header.episodes, header.instructions)}
+    lengths = {
+        len(each) for each in (header.slots, header.ticks, header.verdicts, header.episodes, header.instructions)
+    }
     gone = header.host == platform.node() and not _is_alive(header.pid)
     return None if len(lengths) != 1 or gone else LiveFrame(header=header, jpeg=jpeg, age_s=age, leg=leg)
 

@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from vecenv_eval.video.episodes import CAMERAS, video_path
 from vecenv_eval.web.rows import UnsafePath, regular_file
 from vecenv_eval.web.runs import Leg
 
+if TYPE_CHECKING:
+    from av.container import InputContainer
+
 # Every camera of a video, as it was written.
 WHOLE = "all"
 # Most points of a curve, and of what a policy noted, lines and characters.
@@ -32,6 +35,8 @@ ACTION_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 # Joints of the robot, which come first in a state: LIBERO's arm and fingers, SIMPLER's robots.
 _JOINTS = {"libero": 9, "simpler/bridge": 8, "simpler/google_robot": 11}
 _KEPT = 8
+# Longest side of a video's images, pixels.
+_LARGEST = 8192
 _Value = TypeVar("_Value")
 
 
@@ -166,7 +171,7 @@ def _video_facts(path: Path, cameras: Sequence[str]) -> VideoFacts:
     import av
 
     try:
-        with av.open(str(path), options={"protocol_whitelist": "file"}) as container:
+        with _opened(path) as container:
             stream = container.streams.video[0]
             frames, rate = stream.frames, stream.average_rate
             width, height = stream.width, stream.height
@@ -174,11 +179,20 @@ def _video_facts(path: Path, cameras: Sequence[str]) -> VideoFacts:
         raise Unreadable(_sentence(path, error)) from None
     if not (frames and rate and width and height):
         raise Unreadable(f"{path.name} cannot be played: it holds no frames")
+    if max(width, height) > _LARGEST:
+        raise Unreadable(f"{path.name} cannot be played: its images are {width} x {height} pixels")
     # Images are square and of one size unless a camera was left out; then nobody knows which is which.
     known = len(cameras) > 1 and width == height * len(cameras)
     return VideoFacts(
         path=path, frames=frames, fps=float(rate), width=width, height=height, cameras=tuple(cameras) if known else ()
     )
+
+
+def _opened(path: Path) -> InputContainer:
+    """A video file, read as an mp4 whatever it claims to be: other formats may name further files."""
+    import av
+
+    return av.open(str(path), format="mp4", options={"protocol_whitelist": "file"})
 
 
 def _sentence(path: Path, error: Exception) -> str:
@@ -207,7 +221,7 @@ def _decoded(video: VideoFacts, number: int) -> np.ndarray:
     import av
 
     try:
-        with av.open(str(video.path), options={"protocol_whitelist": "file"}) as container:
+        with _opened(video.path) as container:
             stream = container.streams.video[0]
             assert stream.time_base is not None
             wanted = round(number / video.fps / stream.time_base)
@@ -276,5 +290,3 @@ def _log_lines(path: Path) -> tuple[list[Any], bool]:
         except (ValueError, RecursionError):
             found.append(line)
     return found, whole and len(lines) <= MOST_LINES
-
-

@@ -78,7 +78,7 @@ class Redrawer:
             env.set_state(replace(state, qpos=qpos, qvel=qvel, time=np.array(row[:1])))
             images = env.observe_egocentric().images
             names = list(images)
-            if camera != "all" and camera not in images or not names:
+            if (camera != "all" and camera not in images) or not names:
                 raise NotFound(f"the scene has no camera {camera!r:.50}; it has {', '.join(names) or 'none'}")
             return np.asarray(images[camera if camera in images else names[0]][0])
         except (Unreadable, NotFound):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Annotated, Any, Literal, cast
@@ -45,8 +46,8 @@ from vecenv_eval.web.run_models import (
 )
 from vecenv_eval.web.runs import Leg, RunReader, Snapshot
 
-# Seconds between two looks for a reader of the stream.
-_LOOK_S = 0.5
+# Seconds between two looks for a reader of the stream, and the share of the time that they may take.
+_LOOK_S, _SHARE = 0.5, 0.2
 _MOST_ROWS, _MOST_STREAMS = 200, 64
 _QUALITY = 85
 # How lists begin: what needs a look.
@@ -133,7 +134,9 @@ class Runs:
             return _jpeg(video_frame(video, tick, camera), size)
         demo = self.recordings.demo(leg, record.key)
         if demo is None or demo.joints is None:
-            raise NotFound("no images of this episode were recorded: --video all or --record-states keep what they need")
+            raise NotFound(
+                "no images of this episode were recorded: --video all or --record-states keep what they need"
+            )
         return _jpeg(self.redrawer.frame(demo, tick, camera), size)
 
 
@@ -228,7 +231,9 @@ def _add_recordings(router: APIRouter, runs: Runs) -> None:
             recorded=runs.recorded(leg, record),
         )
 
-    @router.get("/{run}/episodes/{key}/frame", response_class=Response, responses={200: {"content": {"image/jpeg": {}}}})
+    @router.get(
+        "/{run}/episodes/{key}/frame", response_class=Response, responses={200: {"content": {"image/jpeg": {}}}}
+    )
     def frame(
         run: RunName,
         key: Key,
@@ -247,7 +252,9 @@ def _add_recordings(router: APIRouter, runs: Runs) -> None:
         found = runs.recordings.video(leg, record.key)
         if found is None:
             raise NotFound("this episode has no video: `vecenv eval --video all` writes one an episode")
-        return FileResponse(found.path, media_type="video/mp4", filename=found.path.name, content_disposition_type="inline")
+        return FileResponse(
+            found.path, media_type="video/mp4", filename=found.path.name, content_disposition_type="inline"
+        )
 
     @router.get("/{run}/episodes/{key}/curves")
     def curves_of(run: RunName, key: Key) -> Curves:
@@ -424,6 +431,7 @@ async def _send_changes(socket: WebSocket, runs: Runs, run: str) -> None:
     processes: list[list[str]] = []
     try:
         while True:
+            began = time.monotonic()
             snapshot, frames, state = await run_in_threadpool(_look, runs, run)
             if (snapshot.version, state) != seen:
                 seen = (snapshot.version, state)
@@ -436,7 +444,7 @@ async def _send_changes(socket: WebSocket, runs: Runs, run: str) -> None:
                 if frame.identity not in sent_frames:
                     await socket.send_bytes(frame.message())
             sent_frames = {frame.identity for frame in frames}
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(max(_LOOK_S, (time.monotonic() - began) / _SHARE))
     except (WebSocketDisconnect, RuntimeError, OSError):
         return  # the reader has gone
 

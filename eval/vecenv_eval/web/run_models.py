@@ -232,7 +232,7 @@ def run_info(run: Snapshot, state: State) -> RunInfo:
                 **_counted(row),
             )
             for leg in run.legs
-            for row in leg.summary.tasks
+            for row in leg.tasks
         ],
         problems=[clean(problem) for problem in run.problems[:100]],
     )
@@ -246,7 +246,7 @@ def _leg_info(leg: Leg) -> LegInfo:
         policy=clean(leg.policy),
         seed=leg.seed,
         conditions=clean(leg.conditions),
-        counts=counts_of(leg.summary.total, None if leg.planned is None else len(leg.planned)),
+        counts=counts_of(leg.total, None if leg.planned is None else len(leg.planned)),
         writing=leg.writing,
         changed=leg.changed,
     )

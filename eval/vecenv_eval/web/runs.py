@@ -14,19 +14,20 @@ import re
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from vecenv.errors import NotFound, VecenvError
+from vecenv.errors import NotFound
 from vecenv_eval.conditions import describe
 from vecenv_eval.config import EvalConfig, setting
 from vecenv_eval.episodes import Episode
-from vecenv_eval.report.summary import Row, Summary, summarise, wilson
+from vecenv_eval.report.summary import TOTAL, Row, summarise, wilson
 from vecenv_eval.results import CAMPAIGN
 from vecenv_eval.store import CONFIG, RESULTS, SUMMARY, Record, StoreError
+from vecenv_eval.web.plans import Plan, planned
 from vecenv_eval.web.rows import RowReader, UnsafePath, regular_file
 
 # Folders below the one that was named: seed, suite; and shards of the submitit engine below those.
@@ -82,12 +83,26 @@ class Leg:
             return ""
 
     @cached_property
-    def summary(self) -> Summary:
-        """The numbers; episodes that are planned and have not ended are missing ones."""
-        records, planned = list(self.records.values()), self.planned
-        wanted = sorted((planned or frozenset()) | self.records.keys())
-        texts = {**self.instructions, **{record.task: record.instruction for record in records}}
-        return summarise(records, wanted, suite=self.suite, policy=self.policy, instructions=_ByTask(texts))
+    def tasks(self) -> tuple[Row, ...]:
+        """The numbers of each task; episodes that are planned and have not ended are missing ones."""
+        by_task: dict[int, list[Record]] = {}
+        for record in self.records.values():
+            by_task.setdefault(record.task, []).append(record)
+        wanted: dict[int, list[Episode]] = {}
+        for episode in (self.planned or frozenset()) | self.records.keys():
+            wanted.setdefault(episode.task, []).append(episode)
+        texts = {**self.instructions, **{record.task: record.instruction for record in self.records.values()}}
+        return tuple(
+            summarise(
+                by_task.get(task, ()), wanted[task], suite=self.suite, policy=self.policy, instructions=_ByTask(texts)
+            ).tasks[0]
+            for task in sorted(wanted)
+        )
+
+    @cached_property
+    def total(self) -> Row:
+        """All tasks pooled."""
+        return pooled(self.tasks)
 
 
 class _ByTask(Sequence[str]):
@@ -126,7 +141,9 @@ class Snapshot:
     @cached_property
     def rows(self) -> Mapping[str, tuple[Leg, Record]]:
         """Every episode's leg and record by its key."""
-        return {episode_key(leg, episode): (leg, record) for leg in self.legs for episode, record in leg.records.items()}
+        return {
+            episode_key(leg, episode): (leg, record) for leg in self.legs for episode, record in leg.records.items()
+        }
 
     @cached_property
     def order(self) -> Mapping[str, int]:
@@ -146,21 +163,7 @@ class Snapshot:
     @cached_property
     def total(self) -> Row:
         """All episodes of all legs pooled."""
-        totals = [leg.summary.total for leg in self.legs]
-        names = ("episodes", "successes", "first", "final", "faults", "errors", "missing")
-        counts = {name: sum(getattr(total, name) for total in totals) for name in names}
-        count, solved = counts["episodes"], counts["successes"]
-        low, high = wilson(solved, count) if count else (None, None)
-        steps = sum((total.steps_to_solve or 0) * total.successes for total in totals)
-        return Row(
-            task="all",
-            instruction="",
-            rate=solved / count if count else None,
-            low=low,
-            high=high,
-            steps_to_solve=steps / solved if solved else None,
-            **counts,
-        )
+        return pooled([leg.total for leg in self.legs])
 
     def state(self, fresh_frames: bool = False) -> str:
         """``"running"``, ``"complete"`` (every planned episode has a verdict), ``"stopped"`` or ``"empty"``.
@@ -185,6 +188,24 @@ def _is_fresh(leg: Leg, now: float) -> bool:
     return leg.changed is not None and now - leg.changed < _FRESH_S and leg.changed > (leg.summarised or 0)
 
 
+def pooled(rows: Sequence[Row]) -> Row:
+    """Several rows as one."""
+    names = ("episodes", "successes", "first", "final", "faults", "errors", "missing")
+    counts = {name: sum(getattr(row, name) for row in rows) for name in names}
+    verdicts, solved = counts["episodes"], counts["successes"]
+    low, high = wilson(solved, verdicts) if verdicts else (None, None)
+    steps = sum((row.steps_to_solve or 0) * row.successes for row in rows)
+    return Row(
+        task=TOTAL,
+        instruction="",
+        rate=solved / verdicts if verdicts else None,
+        low=low,
+        high=high,
+        steps_to_solve=steps / solved if solved else None,
+        **counts,
+    )
+
+
 def episode_key(leg: Leg, episode: Episode) -> str:
     """What an episode of a run is called in addresses: letters, digits, ``-``, ``_`` and ``.``."""
     return f"{slug(leg.name)}.{slug(episode.suite)}.{episode.task}.{episode.episode}"
@@ -193,21 +214,6 @@ def episode_key(leg: Leg, episode: Episode) -> str:
 def slug(text: str) -> str:
     """Text without what has a meaning in an address."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", text).strip("-") or "run"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Plan:
-    """What a config asks for."""
-
-    suite: str
-    episodes: frozenset[Episode]
-    instructions: Mapping[int, str]
-
-    def joined(self, other: _Plan) -> _Plan:
-        """What both ask for."""
-        return replace(
-            self, episodes=self.episodes | other.episodes, instructions={**self.instructions, **other.instructions}
-        )
 
 
 @dataclass(kw_only=True)
@@ -236,7 +242,7 @@ class RunReader:
         self.name, self.folder = name, folder.resolve()
         self._lock, self._due = threading.Lock(), 0.0
         self._found: dict[Path, _Found] = {}
-        self._planned: dict[str, _Plan | None] = {}
+        self._planned: dict[str, Plan | None] = {}
         self._snapshot: Snapshot | None = None
         self._signature: Any = None
         if not self.folder.is_dir():
@@ -295,7 +301,9 @@ class RunReader:
             for each in inside:
                 seen += 1
                 if seen > _MOST_FOLDERS:
-                    problems.append(f"{self.folder.name} has more than {_MOST_FOLDERS} folders; the others are not shown")
+                    problems.append(
+                        f"{self.folder.name} has more than {_MOST_FOLDERS} folders; the others are not shown"
+                    )
                     return
                 if (each / CONFIG).is_file():
                     yield from [(each, "")] if not (each / _SHARDS).is_dir() else []
@@ -363,17 +371,21 @@ class RunReader:
         names = [each.folder.relative_to(self.folder).as_posix() for each in found]
         if names[0] == ".":
             return self.folder.name
-        return names[0] if len(names) == 1 or names[1].startswith(f"{names[0]}/") else f"{names[0]} and {len(names) - 1} more"
+        return (
+            names[0]
+            if len(names) == 1 or names[1].startswith(f"{names[0]}/")
+            else f"{names[0]} and {len(names) - 1} more"
+        )
 
-    def _plan(self, settings: Sequence[Mapping[str, Any]]) -> _Plan | None:
+    def _plan(self, settings: Sequence[Mapping[str, Any]]) -> Plan | None:
         """What is planned in the folders of a leg; None where one's config says nothing that can be run here."""
-        whole: _Plan | None = None
+        whole: Plan | None = None
         for number, each in enumerate(settings):
             if number and each.get("shard") and not settings[0].get("shard"):
                 continue  # a job's share of the whole
             text = json.dumps(each, sort_keys=True, default=str)
             if text not in self._planned:
-                self._planned[text] = _planned(each)
+                self._planned[text] = planned(each)
             part = self._planned[text]
             if part is None:
                 return None
@@ -389,24 +401,6 @@ def _group_of(found: _Found) -> str:
     names = [each.name for each in fields(EvalConfig) if setting(each).decides]
     decisive = {name: settings.get(name) for name in names}
     return f"{found.folder.parent}\n{json.dumps(decisive, sort_keys=True, default=str)}"
-
-
-def _planned(settings: Mapping[str, Any]) -> _Plan | None:
-    """What settings ask for; None where they are none, or their suite is not installed here."""
-    from vecenv_eval.runner import chosen_episodes
-    from vecenv_eval.simulator import describe_suite
-
-    try:
-        config = EvalConfig.from_dict(settings)
-        suite = describe_suite(config.suite, config.protocol)
-        _, episodes = chosen_episodes(config, suite)
-    except (VecenvError, ValueError, TypeError, LookupError, OSError, RecursionError):
-        return None
-    return _Plan(
-        suite=suite.name,
-        episodes=frozenset(Episode(suite.name, task, number) for task in episodes for number in episodes[task]),
-        instructions={task: suite.instructions[task] for task in episodes},
-    )
 
 
 def _folders_in(folder: Path, root: Path, problems: list[str]) -> list[Path]:

@@ -174,7 +174,9 @@ def test_the_frame_of_an_actor_reaches_the_folder(tmp_path: Path) -> None:
     outbox.publish("node/../7", b"old")
     outbox.publish("node/../7", b"new")
     ledger.receive(Report(live=outbox.take_live()))
-    assert [(path.name, path.read_bytes()) for path in (store.folder / "live").iterdir()] == [("node-..-7.frame", b"new")]
+    assert [(path.name, path.read_bytes()) for path in (store.folder / "live").iterdir()] == [
+        ("node-..-7.frame", b"new")
+    ]
     assert outbox.take_live() == {}
     outbox.publish("node/../7", None)
     ledger.receive(Report(live=outbox.take_live()))
@@ -196,7 +198,9 @@ def test_two_shards_are_seen_while_they_run(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from vecenv.cli import main; main()", "eval", *settings.split(), *policy]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     shards = [
-        subprocess.Popen([*command, "--shard", f"{i}/2", "--out", str(tmp_path / f"part{i}"), "--quiet"], env=environment)
+        subprocess.Popen(
+            [*command, "--shard", f"{i}/2", "--out", str(tmp_path / f"part{i}"), "--quiet"], env=environment
+        )
         for i in (1, 2)
     ]
     try:
@@ -221,7 +225,7 @@ def test_two_shards_are_seen_while_they_run(tmp_path: Path) -> None:
     assert live_frames(run) == []
     assert not list(tmp_path.glob("*/live"))
     (leg,) = run.legs
-    assert (leg.summary.total.episodes, run.state()) == (2, "complete")
+    assert (leg.total.episodes, run.state()) == (2, "complete")
 
 
 def test_live_images_change_no_verdict(tmp_path: Path) -> None:

@@ -127,7 +127,9 @@ def test_pages_have_every_episode_once(client: Client) -> None:
     assert keys(client, order="recent") == keys(client, order="number")[::-1]
 
 
-@pytest.mark.parametrize("query", [{"limit": 0}, {"limit": 501}, {"offset": -1}, {"show": "x"}, {"order": "'--"}, {"task": "a"}])
+@pytest.mark.parametrize(
+    "query", [{"limit": 0}, {"limit": 501}, {"offset": -1}, {"show": "x"}, {"order": "'--"}, {"task": "a"}]
+)
 def test_queries_that_mean_nothing_are_refused(client: Client, query: dict[str, Any]) -> None:
     assert next(iter(query)) in client.refusal("/api/runs/run/episodes", 422, **query)
 
@@ -162,7 +164,7 @@ def test_curves_are_what_was_recorded(client: Client) -> None:
     assert (recorded["frames"], recorded["actions"], recorded["states"], recorded["ticks"]) == ("states", True, True, 6)
     curves = client.json(f"{address(DRIVEN)}/curves")
     assert curves["ticks"] == list(range(6))
-    assert np.array(list(curves["actions"].values())).T == pytest.approx(a_recording(1).actions, abs=1e-5)
+    assert pytest.approx(a_recording(1).actions, abs=1e-5) == np.array(list(curves["actions"].values())).T
     assert len(curves["joints"]) == 9
     assert curves["joints"]["joint 1"][2] == 61
     assert "--record" in client.refusal(f"{address(FILMED)}/curves", 404)
@@ -184,6 +186,21 @@ def test_damaged_recordings_are_sentences(client: Client, folder: Path) -> None:
     assert "cannot be played" in client.refusal(f"{address(DAMAGED)}/frame", 422)
     assert "HDF5" in client.refusal(f"{address(DAMAGED)}/curves", 422)
     assert all(str(folder) not in problem for problem in recorded["problems"])
+
+
+def test_a_playlist_that_names_other_files_is_no_video(tmp_path: Path) -> None:
+    folder = write_results(tmp_path / "run", records(), config=CONFIG)
+    with VideoWriter(tmp_path / "secret.mp4") as video:
+        video.add(np.zeros((32, 32, 3), np.uint8))
+    path = video_path(folder, Episode(SUITE, 0, 0))
+    path.parent.mkdir()
+    for text in (
+        f"ffconcat version 1.0\nfile {tmp_path}/secret.mp4\n",
+        f"#EXTM3U\n#EXTINF:1,\n{tmp_path}/secret.mp4\n",
+    ):
+        path.write_text(text)
+        with viewing(folder) as client:
+            assert "cannot be played" in client.refusal(f"{address(FILMED)}/frame", 422)
 
 
 def test_a_log_is_text(client: Client) -> None:

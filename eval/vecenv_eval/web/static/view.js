@@ -167,7 +167,7 @@ async function begin() {
     });
     document.body.dataset.ready = "";
   } catch (error) {
-    complain(error);
+    complain(error.status === 404 ? new Error("This server shows no runs: vecenv view DIR does.") : error);
   }
 }
 
