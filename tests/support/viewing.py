@@ -48,7 +48,7 @@ class Client:
         assert "Traceback" not in body["error"]
         return body["error"]
 
-    def image(self, path: str, **query: Any) -> tuple[int, int, tuple[int, int, int]]:
+    def image(self, path: str, **query: Any) -> tuple[int, int, tuple[int, ...]]:
         """Width, height and the middle pixel of a JPEG."""
         import io
 

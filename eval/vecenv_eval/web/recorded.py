@@ -168,14 +168,14 @@ def _cameras_of(leg: Leg) -> tuple[str, ...]:
 
 
 def _video_facts(path: Path, cameras: Sequence[str]) -> VideoFacts:
-    import av
+    from av.error import FFmpegError
 
     try:
         with _opened(path) as container:
             stream = container.streams.video[0]
             frames, rate = stream.frames, stream.average_rate
             width, height = stream.width, stream.height
-    except (av.FFmpegError, IndexError, ValueError, OSError) as error:
+    except (FFmpegError, IndexError, ValueError, OSError) as error:
         raise Unreadable(_sentence(path, error)) from None
     if not (frames and rate and width and height):
         raise Unreadable(f"{path.name} cannot be played: it holds no frames")
@@ -218,7 +218,7 @@ def video_frame(video: VideoFacts, tick: int, camera: str = WHOLE) -> np.ndarray
 
 
 def _decoded(video: VideoFacts, number: int) -> np.ndarray:
-    import av
+    from av.error import FFmpegError
 
     try:
         with _opened(video.path) as container:
@@ -233,7 +233,7 @@ def _decoded(video: VideoFacts, number: int) -> np.ndarray:
                     break
             if last is not None:
                 return last.to_ndarray(format="rgb24")
-    except (av.FFmpegError, ValueError, OSError) as error:
+    except (FFmpegError, ValueError, OSError) as error:
         raise Unreadable(_sentence(video.path, error)) from None
     raise Unreadable(f"{video.path.name} has no frame {number}")
 

@@ -11,6 +11,7 @@ import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support.filmed import record
@@ -23,6 +24,7 @@ from vecenv_eval.web.runs import RunReader, Snapshot, open_runs
 WRITER = """
 import sys, time
 from pathlib import Path
+from typing import Any
 from support.filmed import record
 from vecenv_eval.store import ResultStore
 store = ResultStore.open(Path(sys.argv[1]))
@@ -37,7 +39,7 @@ def look(folder: Path) -> Snapshot:
     return RunReader("run", folder).snapshot()
 
 
-def write_some(folder: Path, suite: str = "libero_goal", **settings: object) -> Path:
+def write_some(folder: Path, suite: str = "libero_goal", **settings: Any) -> Path:
     return write_results(folder, some_records(lambda task, episode: episode < 3, suite=suite), suite=suite, **settings)
 
 
