@@ -6,6 +6,7 @@ thread); two are kept, for two runs side by side.
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as Overdue
@@ -22,10 +23,12 @@ from vecenv_eval.web.recorded import DemoFacts, Unreadable
 # Seconds that a request waits; the scene goes on being built.
 WAIT_S = 60.0
 _KEPT = 2
+# Requests that may wait for an image, so that there are threads for other requests.
+_MOST_WAITING = 8
 
 
 class Busy(ServiceError):
-    """The scene is still being built."""
+    """The image cannot be drawn yet."""
 
 
 class Redrawer:
@@ -34,6 +37,7 @@ class Redrawer:
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="redraw")
         self._envs: OrderedDict[Any, BatchEnv] = OrderedDict()
+        self._places = threading.Semaphore(_MOST_WAITING)
 
     def frame(self, recorded: DemoFacts, tick: int, camera: str) -> np.ndarray:
         """The image before a tick, uint8 [H, W, 3]; after the last action, the end.
@@ -46,14 +50,19 @@ class Redrawer:
         Raises:
             NotFound: the scene has no such camera.
             Unreadable: the scene cannot be made here, or does not have such states.
-            Busy: the scene is still being built.
+            Busy: the scene is still being built, or too many wait.
         """
-        job = self._thread.submit(self._draw, recorded, tick, camera)
+        if not self._places.acquire(blocking=False):
+            raise Busy(f"{_MOST_WAITING} images wait to be drawn already: ask again")
         try:
-            return job.result(WAIT_S)
-        except Overdue:
-            job.cancel()
-            raise Busy("the scene of this episode is still being built: ask again") from None
+            job = self._thread.submit(self._draw, recorded, tick, camera)
+            try:
+                return job.result(WAIT_S)
+            except Overdue:
+                job.cancel()
+                raise Busy("the scene of this episode is still being built: ask again") from None
+        finally:
+            self._places.release()
 
     def close(self) -> None:
         """Close the environments."""
