@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from support.live_world import LiveWorld, config, session
 from vecenv_eval.panel.frames import WALL, View
-from vecenv_eval.panel.session import Session
+from vecenv_eval.panel.session import Action, Session
 from vecenv_eval.panel.state import SessionClosed, SessionError, UnknownSlot
 from vecenv_eval.store import ResultStore
 
 import vecenv
+
+ACTIONS: tuple[Action, ...] = ("play", "pause", "step", "stop", "reset")
 
 
 def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
@@ -227,7 +229,7 @@ def test_calls_of_many_threads_at_once_leave_a_session_that_works() -> None:
         generator = np.random.default_rng(number)
         for _ in range(15):
             try:
-                live.act(["play", "pause", "step", "stop", "reset"][generator.integers(5)])
+                live.act(ACTIONS[generator.integers(5)])
                 live.state()
                 live.frames.want(View(int(generator.integers(8)), "agentview", 32))
             except SessionError:
@@ -254,7 +256,31 @@ def test_nothing_is_drawn_that_nobody_asked_for() -> None:
         live.wait_until("ready", timeout=20)
         live.act("play")
         live.wait_until("finished", timeout=20)
-    assert all(env.drawn == [] for env in world.envs)
+    assert world.last.drawn == []
+
+
+def test_nothing_is_drawn_any_more_when_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vecenv_eval.panel.frames._INTEREST_S", 0.0)
+    world = LiveWorld()
+    with session(world) as live:
+        live.wait_until("ready", timeout=20)
+        live.frames.want(View(0, "wrist", 32))
+        until(lambda: live.frames.newest(View(0, "wrist", 32)))
+        live.act("play")
+        live.wait_until("finished", timeout=20)
+    assert world.last.drawn == [(0, "wrist")]
+
+
+def test_the_end_of_an_episode_is_seen_by_who_looks_although_the_next_has_begun() -> None:
+    world = LiveWorld()
+    view = View(0, "wrist", 32)
+    with session(world, config=config(tasks="0", episodes="2", num_envs=1)) as live:
+        live.wait_until("ready", timeout=20)
+        live.frames.want(view)
+        until(lambda: live.frames.newest(view))
+        live.act("step", 2)
+        until(lambda: world.last.drawn == [(0, "wrist")] * 2)
+        assert live.state().slots[0].episode == 1
 
 
 def test_a_frame_is_drawn_once_however_often_it_is_asked_for() -> None:
@@ -268,10 +294,10 @@ def test_a_frame_is_drawn_once_however_often_it_is_asked_for() -> None:
         for _ in range(50):
             live.frames.want(view)
         time.sleep(0.1)
-        assert world.envs[-1].drawn == [(1, "wrist")]
+        assert world.last.drawn == [(1, "wrist")]
         live.act("step")
         live.frames.want(view)
-        until(lambda: len(world.envs[-1].drawn) == 2)
+        until(lambda: len(world.last.drawn) == 2)
 
 
 def test_a_frame_says_what_it_shows_and_shows_it() -> None:
@@ -301,11 +327,25 @@ def test_the_wall_is_one_image_with_a_tile_a_slot() -> None:
     assert np.abs(middles[:, 0] - [40, 60, 80, 100, 120, 140]).max() < 10
 
 
+def test_a_slot_that_is_shown_and_on_the_wall_is_drawn_once() -> None:
+    world = LiveWorld()
+    with session(world, config=config(tasks="1", episodes="3", max_steps=1000)) as live:
+        live.wait_until("ready", timeout=20)
+        hold = threading.Event()
+        held = live.call(lambda env: hold.wait(10))  # both are asked for before any is drawn
+        live.frames.want(View(1, "agentview", 64))
+        live.frames.want(WALL)
+        hold.set()
+        assert held.result(10)
+        until(lambda: live.frames.newest(WALL) and live.frames.newest(View(1, "agentview", 64)))
+    assert sorted(world.last.drawn) == [(slot, "agentview") for slot in range(3)]
+
+
 def test_images_that_cannot_be_drawn_end_no_run() -> None:
     world = LiveWorld()
     with session(world) as live:
         live.wait_until("ready", timeout=20)
-        world.envs[-1].broken = RuntimeError("no GL")  # pyright: ignore[reportAttributeAccessIssue]
+        world.last.broken = RuntimeError("no GL")
         live.frames.want(WALL)
         until(lambda: live.frames.error)
         assert "no GL" in str(live.frames.error)

@@ -18,7 +18,7 @@ import pytest
 from support import streams
 from vecenv_eval.store import ResultStore
 
-COMMAND = (sys.executable, "-m", "vecenv_eval.web", "--no-open", "--port", "0")
+COMMAND = (sys.executable, "-m", "vecenv_eval.cli.serve", "--no-open", "--port", "0")
 WRITER = {"X-Writer": "first-client"}
 
 

@@ -83,7 +83,7 @@ def test_readers_of_the_same_view_share_one_drawing(server: Server, world: LiveW
     for reader in readers:
         streams.until(reader, lambda each: each["type"] == "frame")
         reader.close()
-    assert world.envs[-1].drawn == [(2, "agentview")]  # pyright: ignore[reportAttributeAccessIssue]
+    assert world.last.drawn == [(2, "agentview")]
     assert live.frames.encoded == 1
 
 

@@ -69,6 +69,13 @@ def color(slot: int, tick: int) -> tuple[int, int, int]:
 class LiveWorld(FakeWorld):
     """Makes such environments."""
 
+    @property
+    def last(self) -> LiveEnv:
+        """The environment that was made last."""
+        env = self.envs[-1]
+        assert isinstance(env, LiveEnv)
+        return env
+
     def make(self, suite: str, **options: Any) -> LiveEnv:
         made = FakeWorld.make(self, suite, **options)
         env = LiveEnv(

@@ -10,15 +10,16 @@ from typing import Any
 
 from vecenv_eval.web.server import Server
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 
-def opened(server: Server, headers: Mapping[str, str] | None = None) -> ClientConnection:
+def opened(server: Server, headers: Mapping[str, str] | None = None) -> Connection:
     """A connection to the stream."""
     return opened_at(server.url, headers)
 
 
-def opened_at(address: str, headers: Mapping[str, str] | None = None) -> ClientConnection:
+def opened_at(address: str, headers: Mapping[str, str] | None = None) -> Connection:
     """A connection to the stream of the server at an address."""
     url = f"{address.replace('http', 'ws', 1)}/api/stream"
     return connect(url, additional_headers=dict(headers or {}), max_size=None, compression=None, close_timeout=1)
@@ -33,7 +34,7 @@ def status(server: Server, headers: Mapping[str, str] | None = None) -> int:
         return error.response.status_code
 
 
-def subscribe(stream: ClientConnection, **wanted: Any) -> None:
+def subscribe(stream: Connection, **wanted: Any) -> None:
     """Say what to show."""
     stream.send(json.dumps({"subscribe": wanted}))
 
@@ -46,7 +47,7 @@ def read(message: str | bytes) -> tuple[dict[str, Any], bytes]:
     return json.loads(message[4 : 4 + length]), message[4 + length :]
 
 
-def until(stream: ClientConnection, fits: Callable[[dict[str, Any]], bool], seconds: float = 20.0) -> dict[str, Any]:
+def until(stream: Connection, fits: Callable[[dict[str, Any]], bool], seconds: float = 20.0) -> dict[str, Any]:
     """The header of the first message that fits."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -59,7 +60,7 @@ def until(stream: ClientConnection, fits: Callable[[dict[str, Any]], bool], seco
     raise AssertionError("no such message came")
 
 
-def closed(stream: ClientConnection) -> int | None:
+def closed(stream: Connection) -> int | None:
     """The code that the server closes a connection with; what comes before is read and dropped."""
     try:
         while True:

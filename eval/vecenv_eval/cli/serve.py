@@ -178,3 +178,6 @@ def _run(
 
 
 serve_command = with_settings(_serve, SETTINGS, shown=_SHOWN, helps=_HELPS)
+
+if __name__ == "__main__":  # where the console command is not installed
+    typer.run(serve_command)

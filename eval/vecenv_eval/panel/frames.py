@@ -36,8 +36,13 @@ QUALITY = 80
 MOST_VIEWS = 128
 # Slots of the wall that are drawn in one call, and seconds that one turn of drawing tiles may take.
 _TILES_AT_ONCE, _TURN_S, _IDLE_TURN_S = 8, 0.05, 0.4
-# While a run is played: after drawing for some time, so many times that long pass before it is drawn again.
-_REST = 2.0
+# While a run is played: after drawing for some time, so many times that long pass before it is drawn again, and no more
+# than this many seconds. The first image of a scene takes long and does not count.
+_REST, _LONGEST_REST_S = 2.0, 10.0
+# The wall's camera, where there is one of that name; otherwise the first.
+_WALL_CAMERA = "agentview"
+# Seconds after which nobody is taken to look at a view that was not asked for again.
+_INTEREST_S = 5.0
 _BACKGROUND = 24
 
 
@@ -98,10 +103,11 @@ class FrameHub:
         self.cameras: tuple[str, ...] = ()
         self.image_size: tuple[int, int] | None = None
         self._wanted: dict[Key, None] = {}
+        self._asked: dict[Key, float] = {}
         self._busy: set[Key] = set()
         self._frames: dict[Key, Frame] = {}
         self._tiles = np.zeros((0, TILE, TILE, 3), np.uint8)
-        self._tile_revisions, self._tile_ticks = np.zeros((2, 0), int)
+        self._tile_revisions, self._tile_ticks = np.zeros(0, int), np.zeros(0, int)
         self._not_before = 0.0
         self._generation = object()
 
@@ -114,6 +120,7 @@ class FrameHub:
     def want(self, key: Key) -> None:
         """Ask for one more frame of a view; nothing happens if there is none newer to be had."""
         with self._lock:
+            self._asked[key] = time.monotonic()
             if self.error or key in self._wanted or key in self._busy or not self._is_stale(key):
                 return
             self._wanted[key] = None
@@ -145,7 +152,7 @@ class FrameHub:
                 self.error = how_to_install("PIL")
             count = env.num_envs
             self._tiles = np.full((count, TILE, TILE, 3), _BACKGROUND, np.uint8)
-            self._tile_revisions, self._tile_ticks = np.zeros((2, count), int)
+            self._tile_revisions, self._tile_ticks = np.zeros(count, int), np.zeros(count, int)
 
     def lost(self) -> None:
         """There is no environment any more."""
@@ -173,29 +180,30 @@ class FrameHub:
         try:
             views = [key for key in keys if isinstance(key, View) and self._is_stale(key)]
             if views:
-                self._draw_views(env, views)
+                self._draw_views(env, views, wall=WALL in keys)
             if WALL in keys and self.cameras:
                 self._draw_wall(env, _TURN_S if playing else _IDLE_TURN_S)
         except Exception as error:  # no GL, no memory: the run goes on without images
             _log.warning("images cannot be drawn: %s", raised(error))
             self.error = f"images cannot be drawn: {raised(error)}"
-        self.preparing, self._has_drawn = False, self._has_drawn or keys != []
         now = time.monotonic()
-        self._not_before = now + _REST * (now - began)
+        self._not_before = now + (min(_REST * (now - began), _LONGEST_REST_S) if self._has_drawn else 0.0)
+        self.preparing, self._has_drawn = False, self._has_drawn or keys != []
 
     def draw_ended(self, env: BatchEnv, slots: Sequence[int]) -> None:
         """Draw the views of slots whose episodes have just ended, while the environment shows their end.
 
-        Of views that somebody has, whether or not they are due: the slot's next image is of another episode.
+        Of views that somebody looks at, whether or not they are due: the slot's next image is of another episode.
         """
+        since = time.monotonic() - _INTEREST_S
         with self._lock:
-            self._wanted.update({key: None for key in self._frames if _slot(key) in slots})
-            if WALL in self._frames:
-                self._wanted[WALL] = None
+            self._asked = {key: asked for key, asked in self._asked.items() if asked > since}
+            self._wanted.update({key: None for key in self._asked if key == WALL or _slot(key) in slots})
         if self._wanted:
             self.draw(env, playing=True, only=slots)
 
-    def _draw_views(self, env: BatchEnv, views: Sequence[View]) -> None:
+    def _draw_views(self, env: BatchEnv, views: Sequence[View], *, wall: bool) -> None:
+        """Draw cameras of slots; what the wall shows as well is put there."""
         cameras = [camera for camera in self.cameras if any(view.camera == camera for view in views)]
         slots = sorted({view.slot for view in views})
         ticks = self._monitor.tick
@@ -206,6 +214,18 @@ class FrameHub:
             image = images[view.camera][view.slot]
             self.image_size = int(image.shape[0]), int(image.shape[1])
             self._encode(view, int(revisions[view.slot]), image.copy(), ticks)
+        if wall and self._wall_camera in images:
+            self._put_tiles(slots, images[self._wall_camera], revisions)
+
+    @property
+    def _wall_camera(self) -> str:
+        return _WALL_CAMERA if _WALL_CAMERA in self.cameras else self.cameras[0]
+
+    def _put_tiles(self, slots: Sequence[int], images: np.ndarray, revisions: np.ndarray) -> None:
+        for slot in slots:
+            self._tiles[slot] = _square(images[slot])
+        rows = list(slots)
+        self._tile_revisions[rows], self._tile_ticks[rows] = revisions[rows], self._monitor.tick
 
     def _encode(self, view: View, revision: int, image: np.ndarray, tick: int) -> None:
         def encode() -> bytes:
@@ -217,16 +237,14 @@ class FrameHub:
         self._submit(view, revision, encode)
 
     def _draw_wall(self, env: BatchEnv, budget_s: float) -> None:
-        began, revisions, camera = time.monotonic(), self._monitor.revisions.copy(), self.cameras[0]
+        began, revisions, camera = time.monotonic(), self._monitor.revisions.copy(), self._wall_camera
         stale = np.flatnonzero(self._tile_revisions < revisions)
         order = stale[np.argsort(self._tile_revisions[stale], kind="stable")].tolist()
         while order and time.monotonic() - began < budget_s:
             some, order = order[:_TILES_AT_ONCE], order[_TILES_AT_ONCE:]
             images = _images(env, some, [camera])[camera]
             self.drawn += len(some)
-            for slot in some:
-                self._tiles[slot] = _square(images[slot])
-            self._tile_revisions[some], self._tile_ticks[some] = revisions[some], self._monitor.tick
+            self._put_tiles(some, images, revisions)
         tiles, ticks = self._tiles.copy(), self._tile_ticks.tolist()
         slots = self._monitor.slots()
 

@@ -56,7 +56,7 @@ class Monitor:
         self._faults: list[str | None] = [None] * count
         self._steps, self._budgets = np.zeros(count, int), np.zeros(count, int)
         self._reward = np.zeros(count)
-        self._success, self._ended = np.zeros((2, count), bool)
+        self._success, self._ended = np.zeros(count, bool), np.zeros(count, bool)
         self._rows: list[np.ndarray] = [np.zeros((0, _WIDTH), np.float32)] * count
         self._count = np.zeros(count, int)
 
@@ -194,7 +194,7 @@ class Monitor:
                 return None
             rows = self._rows[slot][: self._count[slot]].copy()
             episode = self._id(slot)
-        known = np.isfinite(rows).all(axis=0)
+        known = np.atleast_1d(np.isfinite(rows).all(axis=0))
         rounded = np.round(rows.astype(float), _DECIMALS)
         return History(
             slot=slot,

@@ -497,7 +497,10 @@ class Session:
         env = self._monitor.env
         if progress.setting_up or env is None:
             return
-        self._monitor.settled(env)
+        try:
+            self._monitor.settled(env)
+        except VecenvError:  # it failed and was closed; another one follows, or none
+            return
         self._tell("tick", env)
         if not self._ending and not env.done.all():
             self._wait(in_run=True)

@@ -78,10 +78,11 @@ class SlotState:
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint:
-    """A stop of the hand: position (metres) and rotation (wxyz), world frame; whether the grip is closed there."""
+    """A stop of the hand: position (xyz, metres) and rotation (wxyz), world frame; whether the grip is closed there."""
 
-    pos: tuple[float, float, float]
-    quat: tuple[float, float, float, float]
+    # Lengths are not in the types: OpenAPI's schemas of tuples of a fixed length are not read by every tool.
+    pos: tuple[float, ...]
+    quat: tuple[float, ...]
     closed: bool
 
 
@@ -106,7 +107,7 @@ class Planning:
     subtasks: tuple[str, ...]
     subtask: int
     text: str
-    path: tuple[tuple[float, float, float], ...]
+    path: tuple[tuple[float, ...], ...]
     waypoints: tuple[Waypoint, ...]
     cause: str
     tick: int
@@ -173,7 +174,7 @@ class SessionState:
     url_3d: str | None = None
     planning: Planning | None = None
     cameras: tuple[str, ...] = ()
-    image_size: tuple[int, int] | None = None
+    image_size: tuple[int, ...] | None = None
     preparing_images: bool = False
     results: str | None = None
     revision: int = 0
@@ -196,7 +197,7 @@ class History:
     slot: int
     episode_id: str
     step: tuple[int, ...] = ()
-    eef_pos: tuple[tuple[float, float, float], ...] = ()
+    eef_pos: tuple[tuple[float, ...], ...] = ()
     gripper: tuple[float, ...] = ()
     reward: tuple[float, ...] = ()
     action: tuple[tuple[float, ...], ...] = ()

@@ -10,7 +10,7 @@ For development and tests, on a free port and in a thread::
         print(server.url)  # "http://127.0.0.1:40123"
 
 or from a shell: ``vecenv serve --suite libero_object --port 0 --no-open`` prints the address. Without a console
-command: ``python -m vecenv_eval.web --suite libero_object --port 0 --no-open``.
+command: ``python -m vecenv_eval.cli.serve --suite libero_object --port 0 --no-open``.
 """
 
 from __future__ import annotations

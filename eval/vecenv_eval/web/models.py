@@ -31,6 +31,10 @@ class ErrorBody(BaseModel):
     field: str | None = None
 
 
+# What routes that change something answer besides, while another client is the writer or it is not their turn.
+CONFLICT: dict[int | str, dict[str, Any]] = {409: {"model": ErrorBody}}
+
+
 class Health(BaseModel):
     """The server runs."""
 

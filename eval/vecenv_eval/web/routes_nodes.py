@@ -24,7 +24,7 @@ from pydantic import BaseModel, ValidationError
 from vecenv_eval.web.context import Context
 from vecenv_eval.web.errors import Refused
 from vecenv_eval.web.models import (
-    ErrorBody,
+    CONFLICT,
     NodeAnswer,
     NodeBody,
     NodeCatalog,
@@ -42,7 +42,6 @@ from vecenv_eval.web.writer import WriterName
 PACKAGES = ("vecenv.interop.nodes", "voxposer.nodes")
 # Calls of a set that may wait, and seconds that a set is given to shut down.
 _MOST_WAITING, _SHUTDOWN_S = 8, 10.0
-_CONFLICT = {409: {"model": ErrorBody}}
 _Result = TypeVar("_Result")
 
 
@@ -120,7 +119,7 @@ def nodes_router(context: Context, host: NodeHost | None = None) -> APIRouter:
         ]
         return NodeCatalog(nodes=rows, sets=sets)
 
-    @router.post("/nodes/{node_type}", responses=_CONFLICT)
+    @router.post("/nodes/{node_type}", responses=CONFLICT)
     async def call(node_type: str, body: NodeBody, writer: WriterName = None) -> NodeAnswer:
         """Call a node; why it could not do something is its output ``error``."""
         if node_type not in nodes.tools:
@@ -147,14 +146,14 @@ def nodes_router(context: Context, host: NodeHost | None = None) -> APIRouter:
         panel = panel_of(node_set)
         return PanelFields(fields=[each.model_dump() for each in await nodes.call(node_set, panel.fields)])
 
-    @router.post("/panels/{node_set}/fields", responses=_CONFLICT)
+    @router.post("/panels/{node_set}/fields", responses=CONFLICT)
     async def choose(node_set: str, body: PanelField, writer: WriterName = None) -> PanelAnswer:
         """Choose a value; the episode is placed."""
         panel = panel_of(node_set)
         context.writers.claim(f"nodes/{node_set}", writer)
         return _answer(await nodes.call(node_set, panel.set_field, body.name, body.value))
 
-    @router.post("/panels/{node_set}/actions", responses=_CONFLICT)
+    @router.post("/panels/{node_set}/actions", responses=CONFLICT)
     async def act(node_set: str, body: PanelAction, writer: WriterName = None) -> PanelAnswer:
         """Play, pause, stop or reset."""
         panel = panel_of(node_set)

@@ -13,11 +13,11 @@ from vecenv_eval.web.context import SESSION, Context
 from vecenv_eval.web.errors import Refused
 from vecenv_eval.web.limits import client_of
 from vecenv_eval.web.models import (
+    CONFLICT,
     MOST_SLOTS,
     ActionAnswer,
     ActionBody,
     Done,
-    ErrorBody,
     FieldAnswer,
     FieldBody,
     LoginBody,
@@ -29,7 +29,6 @@ from vecenv_eval.web.security import COOKIE, TOO_MANY
 from vecenv_eval.web.writer import WriterName
 
 Slot = Annotated[int, Query(ge=0, lt=MOST_SLOTS)]
-_CONFLICT = {409: {"model": ErrorBody}}
 
 
 def _changes(body: SessionBody, max_slots: int) -> dict[str, Any]:
@@ -90,7 +89,7 @@ def panel_router(context: Context, session: Session) -> APIRouter:
         context.writers.touch(writer)
         return session.history(slot)
 
-    @router.post("/session", status_code=202, responses=_CONFLICT)
+    @router.post("/session", status_code=202, responses=CONFLICT)
     def build(body: SessionBody, writer: WriterName = None) -> SessionState:
         """Build a batch and a policy; the session is "building", then "ready" or "error"."""
         context.writers.claim(SESSION, writer)
@@ -98,21 +97,21 @@ def panel_router(context: Context, session: Session) -> APIRouter:
         session.build(session.config_of(body.suite, **_changes(body, settings.max_slots)))
         return own_state(writer)
 
-    @router.post("/session/speed", responses=_CONFLICT)
+    @router.post("/session/speed", responses=CONFLICT)
     def speed(body: SpeedBody, writer: WriterName = None) -> SessionState:
         """Limit the speed."""
         context.writers.claim(SESSION, writer)
         session.set_speed(body.ticks_per_second)
         return own_state(writer)
 
-    @router.post("/panel/fields", responses=_CONFLICT)
+    @router.post("/panel/fields", responses=CONFLICT)
     def choose(body: FieldBody, writer: WriterName = None) -> FieldAnswer:
         """Choose a suite, a task or an episode, which is placed in one slot."""
         context.writers.claim(SESSION, writer)
         fields = session.set_field(body.name, body.value)
         return FieldAnswer(fields=fields, snapshot=fields)
 
-    @router.post("/panel/actions", responses=_CONFLICT)
+    @router.post("/panel/actions", responses=CONFLICT)
     def act(body: ActionBody, writer: WriterName = None) -> ActionAnswer:
         """Play, pause, step, stop or reset."""
         context.writers.claim(SESSION, writer)

@@ -123,7 +123,8 @@ class Guard:
     def _is_allowed(self, origin: str, host: str, scope: Scope) -> bool:
         if origin in self._settings.allowed_origins:
             return True
-        scheme = {"ws": "http", "wss": "https"}.get(scope.get("scheme", "http"), scope.get("scheme", "http"))
+        given: str = scope.get("scheme", "http")
+        scheme = {"ws": "http", "wss": "https"}.get(given, given)
         try:
             asked, own = urlsplit(origin), urlsplit(f"{scheme}://{host}")
             same_port = (asked.port or _DEFAULT_PORTS.get(asked.scheme)) == (own.port or _DEFAULT_PORTS[scheme])
