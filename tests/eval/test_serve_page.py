@@ -244,6 +244,7 @@ def test_everything_is_reached_with_the_keyboard_alone(opened: Any) -> None:
     to("#wall")
     press("End")
     assert page.tab.input_value("#slot") == "3"
+    assert page.tab.get_attribute("#wall", "aria-valuetext") == "slot 3, live"
     press("ArrowLeft")
     assert page.tab.input_value("#slot") == "2"
     press("r")

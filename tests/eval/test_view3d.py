@@ -16,7 +16,7 @@ import pytest
 from support.simpler_batches import CARROT, OPEN_TOP, batch
 
 import vecenv
-from vecenv.errors import InvalidInput
+from vecenv.errors import InvalidInput, ServiceError
 
 pytest.importorskip("trimesh")
 pytest.importorskip("viser", reason="needs viser: pip install 'vecenv[viser]'")
@@ -63,7 +63,11 @@ def until(condition: Any, seconds: float = 60.0) -> None:
 
 
 def vertices(glb: bytes) -> np.ndarray:
-    return trimesh.load(io.BytesIO(glb), file_type="glb").to_geometry().vertices
+    return loaded(glb).to_geometry().vertices
+
+
+def loaded(glb: bytes) -> Any:
+    return trimesh.load(io.BytesIO(glb), file_type="glb")
 
 
 def test_geoms_are_in_the_frame_of_their_body() -> None:
@@ -85,7 +89,7 @@ def test_hidden_geoms_and_groups_are_left_out() -> None:
 
 def test_a_texture_tints_what_has_no_texture_coordinates() -> None:
     model = mujoco.MjModel.from_xml_string(SHAPES)
-    scene = trimesh.load(io.BytesIO(glb_of_bodies(model, groups=(1,))[1]), file_type="glb")
+    scene = loaded(glb_of_bodies(model, groups=(1,))[1])
     colors = [tuple(mesh.visual.material.baseColorFactor[:3]) for mesh in scene.geometry.values()]
     assert (255, 0, 0) in colors
 
@@ -173,7 +177,9 @@ def test_a_plan_is_drawn_and_taken_away(libero: Any, view: Scene3D) -> None:
     view.look(libero)
     until(lambda: len(view._plan) == 6)
     assert view._gui.subtask.value == "<b>move</b>"
-    assert not view._server.scene.get_handle_by_name("/plan/avoid").visible
+    avoid = view._server.scene.get_handle_by_name("/plan/avoid")
+    assert avoid is not None
+    assert not avoid.visible
     view.placed(libero)
     until(lambda: not view._plan)
     assert view._gui.subtask.value == ""
@@ -201,6 +207,7 @@ def test_the_objects_of_simpler_are_points_on_their_surfaces(small: Path) -> Non
         for body in model.bodies:
             if not body.name.startswith("objects/"):
                 continue
+            assert body.points is not None
             rotation = np.zeros(9)
             mujoco.mju_quat2Mat(rotation, poses[body.name][3:7])
             points = body.points @ rotation.reshape(3, 3).T + poses[body.name][:3]
@@ -235,12 +242,59 @@ def test_drawers_of_simpler_move_on_their_own(small: Path) -> None:
         env.close()
 
 
+def test_the_view_follows_a_session_and_the_page_chooses_its_slot(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("fastapi")
+    from fastapi.testclient import TestClient
+    from support.live_world import session
+    from vecenv_eval.web.app import create_app
+    from vecenv_eval.web.routes_view3d import attach_view3d
+
+    seen: list[tuple[int, int]] = []
+    monkeypatch.setattr(Scene3D, "watched", True)
+    monkeypatch.setattr(scene3d, "look", lambda env, slot: seen.append((slot, int(env.ticks[slot]))))
+    with session() as live:
+        scene = Scene3D()
+        app = create_app(live)
+        attach_view3d(app, live, scene)
+        live.wait_until("ready", timeout=30)
+        with TestClient(app, base_url="http://127.0.0.1:8000") as client:
+            assert client.get("/api/session").json()["url_3d"] == scene.url
+            until(lambda: (0, 0) in seen)
+            assert client.post("/api/view3d", json={"slot": 4}).json() == {"ok": True}
+            until(lambda: (4, 0) in seen)
+            assert scene._gui.slot.value == 4
+            live.act("step", 3)
+            until(lambda: (4, 3) in seen)  # the last tick too, however soon it came after the one before
+            assert client.post("/api/view3d", json={"slot": -1}).status_code == 422
+        assert scene._closed
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "text"),
+    [(["--port-3d", "8000"], 2, "--port-3d needs --view-3d"), (["--view-3d"], 1, "pip install 'vecenv[viser]'")],
+)
+def test_options_that_cannot_be_had_are_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], options: list[str], status: int, text: str
+) -> None:
+    import typer
+    from vecenv_eval.cli import serve
+
+    installed = serve.is_installed
+    monkeypatch.setattr(serve, "is_installed", lambda module: module != "viser" and installed(module))
+    app = typer.Typer()
+    app.command()(serve.serve_command)
+    with pytest.raises(SystemExit) as ended:
+        app(["--no-open", "--port", "0", *options])
+    assert ended.value.code == status
+    assert text in " ".join(capfd.readouterr().err.split())
+
+
 def test_a_port_in_use_is_a_sentence() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(InvalidInput, match=f"the port of the 3-D view, {port}, is in use"):
+        with pytest.raises(ServiceError, match=f"the port of the 3-D view, {port}, is in use"):
             Scene3D(port)
     with pytest.raises(InvalidInput, match="70000"):
         Scene3D(70000)

@@ -82,18 +82,22 @@ def _serve(
     view_3d: bool = typer.Option(
         False, "--view-3d", help="Also serve a 3-D view, on a port of its own of this machine, without the token."
     ),
-    port_3d: int = typer.Option(0, "--port-3d", min=0, max=65535, help="Port of the 3-D view; 0 for a free one."),
+    port_3d: int | None = typer.Option(
+        None, "--port-3d", min=0, max=65535, help="Port of the 3-D view.", show_default="a free one"
+    ),
     **settings: Any,
 ) -> None:
     """Drive and watch a live batch of environments in the browser."""
-    for module in ("fastapi", "uvicorn", "PIL"):
+    if port_3d is not None and not view_3d:
+        fail("--port-3d needs --view-3d")
+    for module in ("fastapi", "uvicorn", "PIL", *(["viser"] if view_3d else [])):
         if not is_installed(module):
             fail(how_to_install(module), code=1)
     sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
     with user_errors():
         first = _first(settings, config)
         served = _settings(host, token_file, trust_clients, max_slots, allow_host, allow_origin)
-        ports = (port, port_3d if view_3d else None)
+        ports = (port, (port_3d or 0) if view_3d else None)
         _run(first, served, out, ports, open_browser=open_browser, play=play, access_log=access_log)
 
 
@@ -151,17 +155,21 @@ def _run(
         logger = logging.getLogger("vecenv_eval.web.access")
         logger.setLevel(logging.INFO)
         logger.addHandler(Saying(to_stderr))
+    scene = None
+    if ports[1] is not None:
+        from vecenv_eval.web.scene3d import Scene3D
+
+        scene = Scene3D(ports[1])
     with (
         suppress(KeyboardInterrupt),
         reported(),
         Session(first, out=out, max_slots=settings.max_slots, play=play) as session,
     ):
         app = create_app(session, settings)
-        if ports[1] is not None:
+        if scene is not None:
             from vecenv_eval.web.routes_view3d import attach_view3d
-            from vecenv_eval.web.scene3d import Scene3D
 
-            attach_view3d(app, session, Scene3D(ports[1]))
+            attach_view3d(app, session, scene)
         server = Server(app, ports[0])
 
         def started() -> None:

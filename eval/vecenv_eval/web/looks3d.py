@@ -22,6 +22,7 @@ from vecenv.errors import VecenvError
 from vecenv.libero.env import LiberoEnv
 from vecenv.libero.render.cameras import stage_of
 from vecenv.libero.render.culling import DRAWN_GROUPS
+from vecenv.libero.render.options import RenderConfig
 from vecenv.libero.render.sources import visual_source
 from vecenv.libero.scene.bddl import Problem
 from vecenv_eval.web.shapes3d import glb_of_bodies
@@ -109,6 +110,7 @@ class _MujocoLook:
         config, note = self.env.config, ""
         try:
             render = config.render
+            assert isinstance(render, RenderConfig)  # the environment has filled it in
             source = visual_source(config.scenes)
             shown = stage_of(self.problem, self.physics, render.lod, render.colors, source).model
             groups: tuple[int, ...] = DRAWN_GROUPS

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vecenv.contract import BatchEnv
-from vecenv.errors import InvalidInput, MissingDependency, SimulationError, VecenvError
+from vecenv.errors import InvalidInput, MissingDependency, ServiceError, VecenvError
 from vecenv_eval.web.looks3d import Look, look
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ class Scene3D:
 
     Raises:
         MissingDependency: viser is not installed.
-        InvalidInput: the port cannot be used.
+        InvalidInput: the port is no port.
+        ServiceError: the port is in use.
     """
 
     def __init__(self, port: int = 0) -> None:
@@ -228,8 +229,8 @@ class Scene3D:
         if "hand" in poses:
             self._frames["hand"] = scene.add_frame("/hand", axes_length=_AXES, axes_radius=_AXES / 25)
             if first:
-                self._server.initial_camera.look_at = poses["hand"][:3] - (0, 0, 0.15)
-                self._server.initial_camera.position = poses["hand"][:3] + (0.75, 0.3, 0.5)
+                self._server.initial_camera.look_at = poses["hand"][:3] - (0, 0, 0.12)
+                self._server.initial_camera.position = poses["hand"][:3] + (0.6, 0.25, 0.4)
         self._key = taken.key
         self._gui.say(model.note)
 
@@ -245,8 +246,10 @@ class Scene3D:
         self._line("/plan/path", plan.path, _PATH)
         self._line("/plan/way", plan.stops[:, :3], _HAND)
         if len(plan.stops):
-            add, size = self._server.scene.add_batched_axes, {"axes_length": 0.03, "axes_radius": 0.0012}
-            self._plan.append(add("/plan/stops", plan.stops[:, 3:], plan.stops[:, :3], **size))
+            scene, points, quats = self._server.scene, plan.stops[:, :3], plan.stops[:, 3:]
+            self._plan.append(
+                scene.add_batched_axes("/plan/stops", quats, points, axes_length=0.03, axes_radius=0.0012)
+            )
         self._cloud("/plan/targets", plan.targets, _TARGET)
         self._cloud("/plan/avoid", plan.avoid, _AVOID, self._gui.avoidance.value)
         self._cloud("/plan/value", plan.value, plan.value_colors, self._gui.value.value)
@@ -397,7 +400,7 @@ def _serve(port: int) -> viser.ViserServer:
     if port and server.get_port() != port:  # viser takes the next one that is free
         with _silent():
             server.stop()
-        raise InvalidInput(f"the port of the 3-D view, {port}, is in use: give another one, or 0 for any")
+        raise ServiceError(f"the port of the 3-D view, {port}, is in use: give another one, or 0 for any")
     server.scene.set_up_direction("+z")
     server.scene.add_grid("/grid", width=4, height=4, cell_size=0.25, section_size=1.0, position=(0, 0, -0.001))
     server.gui.configure_theme(control_width="small", show_logo=False, show_share_button=False)
@@ -414,4 +417,4 @@ def _port_errors(port: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise SimulationError(f"the 3-D view cannot listen on port {port}: {error}") from error
+        raise ServiceError(f"the 3-D view cannot listen on port {port}: {error}") from error

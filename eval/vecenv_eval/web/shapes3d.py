@@ -50,12 +50,18 @@ def glb_of_bodies(model: mujoco.MjModel, groups: Sequence[int], hidden: Sequence
         mesh = _mesh(model, geom, materials, rgba)
         if mesh is not None:
             parts[int(model.geom_bodyid[geom])].append(mesh)
-    return {body: bytes(trimesh.Scene(meshes).export(file_type="glb")) for body, meshes in parts.items()}
+    return {body: _exported(trimesh.Scene(meshes)) for body, meshes in parts.items()}
+
+
+def _exported(scene: trimesh.Scene) -> bytes:
+    glb = scene.export(file_type="glb")
+    assert isinstance(glb, bytes)
+    return glb
 
 
 def _mesh(model: mujoco.MjModel, geom: int, materials: _Materials, rgba: np.ndarray) -> trimesh.Trimesh | None:
     """A geom in its body's frame; None for a kind of geom that is not drawn."""
-    import trimesh
+    from trimesh.visual import TextureVisuals
 
     size, kind = model.geom_size[geom], int(model.geom_type[geom])
     if kind == _GEOM.mjGEOM_MESH:
@@ -64,7 +70,7 @@ def _mesh(model: mujoco.MjModel, geom: int, materials: _Materials, rgba: np.ndar
         made = _of_primitive(kind, size)
         if made is None:
             return None
-        made.visual = trimesh.visual.TextureVisuals(material=materials.plain(geom, rgba))
+        made.visual = TextureVisuals(material=materials.plain(geom, rgba))
     pose = np.eye(4)
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
@@ -98,6 +104,7 @@ def _of_primitive(kind: int, size: np.ndarray) -> trimesh.Trimesh | None:
 def _of_mesh(model: mujoco.MjModel, geom: int, materials: _Materials, rgba: np.ndarray) -> trimesh.Trimesh:
     """A geom's mesh: a vertex for each combination of position, normal and texture coordinate that a corner has."""
     import trimesh
+    from trimesh.visual import TextureVisuals
 
     mesh = Mesh.of(model, int(model.geom_dataid[geom]))
     textured = len(mesh.texcoord) > 0 and materials.texture(geom) is not None
@@ -114,9 +121,9 @@ def _of_mesh(model: mujoco.MjModel, geom: int, materials: _Materials, rgba: np.n
     if textured:
         # MuJoCo's rows of texture begin at v = 0, those of the pictures that trimesh writes at v = 1.
         uv = mesh.texcoord[corners[:, 2]] * materials.repeat(geom)
-        made.visual = trimesh.visual.TextureVisuals(uv=uv * (1, -1) + (0, 1), material=materials.pictured(geom, rgba))
+        made.visual = TextureVisuals(uv=uv * (1, -1) + (0, 1), material=materials.pictured(geom, rgba))
     else:
-        made.visual = trimesh.visual.TextureVisuals(material=materials.plain(geom, rgba))
+        made.visual = TextureVisuals(material=materials.plain(geom, rgba))
     return made
 
 

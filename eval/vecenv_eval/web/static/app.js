@@ -158,6 +158,10 @@ function render() {
   const count = state.slots.length;
   by("slot").max = Math.max(0, count - 1);
   if (document.activeElement !== by("slot")) by("slot").value = followed;
+  const spokenSlot = state.slots[followed] ? `slot ${followed}, ${verdict(state.slots[followed])}` : "";
+  by("wall").setAttribute("aria-valuemax", Math.max(0, count - 1));
+  by("wall").setAttribute("aria-valuenow", followed);
+  by("wall").setAttribute("aria-valuetext", spokenSlot);
   by("of-slots").textContent = count ? `of ${count}` : "";
   const speed = by("speed");
   const limit = state.ticks_per_second === null || state.ticks_per_second === undefined ? "" : String(state.ticks_per_second);
@@ -192,7 +196,7 @@ function enable() {
     if (id === "slot") by(id).disabled = !on;
     else by(id).setAttribute("aria-disabled", String(!on));
   }
-  by("play").textContent = playing ? "Pause" : is === "paused" ? "Go on" : "Play";
+  by("play").textContent = playing ? "Pause" : is === "paused" ? "Resume" : "Play";
   by("load").textContent = is === "building" ? "Loading\u2026" : "Load";
 }
 

@@ -214,7 +214,9 @@ export class Setup {
     if (state.num_slots) by("slots").value = state.num_slots;
     this.select("policy", this.policyOf(state.policy));
     this.describe();
-    this.place();
+    if (this.place() && state.planned > state.slots.length) {
+      by("placement").textContent = `${state.planned} episodes in ${state.slots.length} slots.`;
+    }
   }
 
   /** The policy in the list that a running one is: a policy may add to its name, such as the model it asks. */
