@@ -61,12 +61,14 @@ class LiveFrame:
         jpeg: the mosaic.
         age_s: seconds since it was written.
         leg: name of the leg whose episodes it shows.
+        folder: the results folder it was in, below the run's; of shards the one of this process.
     """
 
     header: Header
     jpeg: bytes
     age_s: float
     leg: str
+    folder: str
 
     @property
     def identity(self) -> tuple[str, str, int, float]:
@@ -75,7 +77,8 @@ class LiveFrame:
 
     def message(self) -> bytes:
         """The frame as the stream sends it."""
-        return pack({**self.header.model_dump(), "age_s": round(self.age_s, 1), "leg": self.leg}, self.jpeg)
+        about = {"age_s": round(self.age_s, 1), "leg": self.leg, "folder": self.folder}
+        return pack({**self.header.model_dump(), **about}, self.jpeg)
 
 
 def live_frames(run: Snapshot) -> list[LiveFrame]:
@@ -83,8 +86,9 @@ def live_frames(run: Snapshot) -> list[LiveFrame]:
     found: list[LiveFrame] = []
     for leg in run.legs:
         for folder in leg.folders:
+            place = run.name if folder == run.folder else folder.relative_to(run.folder).as_posix()
             for path in _files(folder):
-                frame = _read(path, leg.name)
+                frame = _read(path, leg.name, place)
                 if frame is not None and len(found) < MOST_PROCESSES:
                     found.append(frame)
     return sorted(found, key=lambda frame: (frame.leg, frame.header.process))
@@ -104,7 +108,7 @@ def _files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def _read(path: Path, leg: str) -> LiveFrame | None:
+def _read(path: Path, leg: str, folder: str) -> LiveFrame | None:
     """A frame; None when it is damaged, old, or of a process of this machine that is gone."""
     try:
         about = path.stat()
@@ -119,7 +123,7 @@ def _read(path: Path, leg: str) -> LiveFrame | None:
         len(each) for each in (header.slots, header.ticks, header.verdicts, header.episodes, header.instructions)
     }
     gone = header.host == platform.node() and not _is_alive(header.pid)
-    return None if len(lengths) != 1 or gone else LiveFrame(header=header, jpeg=jpeg, age_s=age, leg=leg)
+    return None if len(lengths) != 1 or gone else LiveFrame(header=header, jpeg=jpeg, age_s=age, leg=leg, folder=folder)
 
 
 def _is_alive(pid: int) -> bool:

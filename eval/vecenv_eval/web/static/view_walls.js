@@ -35,7 +35,7 @@ class ProcessWall {
     this.written = Date.now() / 1000 - header.age_s;
     this.wall.take(header, image);
     const more = header.num_slots > header.slots.length ? ` of ${header.num_slots}` : "";
-    this.caption.textContent = `${this.title}${header.leg}, process ${header.pid} on ${header.host}: ${header.slots.length}${more} slots, ${header.steps_per_s.toFixed(1)} ticks/s`;
+    this.caption.textContent = `${this.title}${header.folder}, process ${header.pid} on ${header.host}: ${header.slots.length}${more} slots, ${header.steps_per_s.toFixed(1)} ticks/s`;
     this.canvas.setAttribute("aria-label", `Images of ${header.slots.length} slots of ${header.leg}`);
     this.describe();
   }
