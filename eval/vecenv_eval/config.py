@@ -174,6 +174,9 @@ class EvalConfig:
     record_lerobot: bool = field(
         default=False, metadata=_about("Write the run as a LeRobot dataset into DIR/lerobot.", resumable=True)
     )
+    live: bool = field(
+        default=False, metadata=_about("Show the newest images of running episodes to `vecenv view`.", resumable=True)
+    )
     store: str = field(
         default="jsonl",
         metadata=_about("Where rows are kept: jsonl (a text file) or sqlite (a database).", decides=False),

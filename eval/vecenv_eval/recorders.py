@@ -1,4 +1,4 @@
-"""The episode recorders that a config asks for: HDF5 recordings, a LeRobot dataset, videos.
+"""The episode recorders that a config asks for: HDF5 recordings, a LeRobot dataset, videos, newest images.
 
 A config and where results go come in; objects that keep ``vecenv_eval.watch.EpisodeRecorder`` go out, recordings first:
 what has a verdict does not run again, so whatever is to be kept of an episode is on the disk before its verdict is.
@@ -11,9 +11,10 @@ from pathlib import Path
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import Suite
+from vecenv_eval.live import LivePublisher
 from vecenv_eval.simulator import Simulator
 from vecenv_eval.sink import Sink
-from vecenv_eval.video.episodes import NONE
+from vecenv_eval.video.episodes import CAMERAS, NONE
 from vecenv_eval.watch import EpisodeRecorder
 
 
@@ -31,7 +32,10 @@ def make_recorders(config: EvalConfig, suite: Suite, simulator: Simulator, sink:
 
         options = make_options(simulator.make, suite=suite.name, **make_arguments(config))
         recorders.append(DemoRecorder(sink.add_demos, suite.instructions, options, states=config.record_states))
-    return [*recorders, *image_recorders(config, sink.folder)]
+    recorders += image_recorders(config, sink.folder)
+    if config.live:
+        recorders.append(LivePublisher(sink.publish, suite.instructions, camera=(*config.camera_names, CAMERAS[0])[0]))
+    return recorders
 
 
 def image_recorders(config: EvalConfig, folder: Path) -> list[EpisodeRecorder]:
@@ -42,7 +46,7 @@ def image_recorders(config: EvalConfig, folder: Path) -> list[EpisodeRecorder]:
 
         recorders.append(LeRobotWriter(folder / "lerobot", image_keys(config.camera_names)))
     if config.video != NONE:
-        from vecenv_eval.video.episodes import CAMERAS, EpisodeVideos
+        from vecenv_eval.video.episodes import EpisodeVideos
 
         recorders.append(EpisodeVideos(folder, config.video, config.camera_names or CAMERAS))
     return recorders

@@ -23,6 +23,7 @@ from vecenv_eval.config import SCRIPTED, VIDEO_CHOICES, ConfigError, EvalConfig,
 from vecenv_eval.engine import EngineError, make_engine
 from vecenv_eval.environments import make_arguments
 from vecenv_eval.episodes import ALL, Episode, Stream, Suite, parse_tasks, shard
+from vecenv_eval.live import cleared
 from vecenv_eval.loop import make_streams
 from vecenv_eval.memory import SlotChoice, choose_slots
 from vecenv_eval.policies import Closing, Policy, Seeing, check_policy, make_policy, raised
@@ -166,7 +167,8 @@ class Evaluation:
             run |= {"num_envs": self.slots.num_envs, "num_envs_reason": self.slots.reason}
         store.write_config({**content, **name, "runs": [*runs, run]})
         try:
-            outcome = self._engine.run(self, store, len(runs), on_progress)
+            with cleared(store.folder):
+                outcome = self._engine.run(self, store, len(runs), on_progress)
         except (ConfigError, EngineError):
             store.discard()
             raise
@@ -269,6 +271,7 @@ def _check_packages(config: EvalConfig) -> None:
     needs = {
         "--record": ("h5py",) if config.records else (),
         f"--video {config.video}": ("av",) if config.video != VIDEO_CHOICES[0] else (),
+        "--live": ("PIL",) if config.live else (),
         "--record-lerobot": ("pyarrow", "av") if config.record_lerobot else (),
     }
     for option, modules in needs.items():

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from vecenv_eval.conditions import stored_as
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.episodes import Episode
+from vecenv_eval.live import write_frame
 from vecenv_eval.store import Record, ResultStore
 
 if TYPE_CHECKING:
@@ -40,6 +41,10 @@ class Sink(Protocol):
 
     def log_error(self, text: str) -> None:
         """Keep a traceback."""
+        ...
+
+    def publish(self, name: str, content: bytes | None) -> None:
+        """Show a process's newest frame (``vecenv_eval.live``) in place of the one before; None when it has ended."""
         ...
 
     def write_conditions(self, conditions: dict[str, Any]) -> None:
@@ -80,6 +85,10 @@ class FolderSink:
     def log_error(self, text: str) -> None:
         """Add a traceback to ``errors.log``."""
         self._store.log_error(text)
+
+    def publish(self, name: str, content: bytes | None) -> None:
+        """Replace the process's file in ``live/``, or remove it."""
+        write_frame(self._store.folder, name, content)
 
     def write_conditions(self, conditions: dict[str, Any]) -> None:
         """Put the conditions into ``config.json``."""

@@ -109,6 +109,15 @@ def replay(
     return ReplayReport(outcomes=tuple(outcomes[i] for i in sorted(outcomes)), problems=tuple(problems))
 
 
+def place(demo: Demo, config: ReplayConfig | None = None) -> BatchEnv:
+    """An environment with one slot, in which a demonstration begins; for a look at its recorded states.
+
+    Raises:
+        VecenvError, ValueError: the simulator refuses to place it.
+    """
+    return _make([demo], config or ReplayConfig())
+
+
 # -- batches -----------------------------------------------------------------------------------------------------------
 
 

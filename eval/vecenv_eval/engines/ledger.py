@@ -7,6 +7,7 @@ later error change nothing.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from vecenv_eval.engines.ray_actor import Report
@@ -81,6 +82,9 @@ class Ledger:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 replace_bytes(path, content)
         self._append(new)
+        for name, frame in report.live.items():
+            with suppress(OSError):  # nothing depends on it
+                self._sink.publish(name, frame)
 
     def fail(self, episode: Episode, cause: str, index: int, batch: int) -> None:
         """Write that an episode has no verdict, and why."""

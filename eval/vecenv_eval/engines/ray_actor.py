@@ -93,6 +93,7 @@ class Report:
         conditions: what the episodes run under.
         refused: why the environment refuses the config, or the policy can act in no episode.
         steps: control ticks that the actor has executed, None when that is not reported.
+        live: the actor's newest frame by its name, see ``vecenv_eval.live``.
     """
 
     records: tuple[Record, ...] = ()
@@ -102,6 +103,7 @@ class Report:
     conditions: Mapping[str, Any] | None = None
     refused: str = ""
     steps: int | None = None
+    live: Mapping[str, bytes | None] = field(default_factory=dict)
 
 
 class Outbox:
@@ -115,6 +117,7 @@ class Outbox:
         self.folder = folder
         self.reports: queue.SimpleQueue[Report | None] = queue.SimpleQueue()
         self._demos: list[Recorded] = []
+        self._live: dict[str, bytes | None] = {}
 
     def records(self) -> dict[Episode, Record]:
         """No record: an actor is given what has none."""
@@ -132,6 +135,15 @@ class Outbox:
     def log_error(self, text: str) -> None:
         """Report a traceback."""
         self.reports.put(Report(error=text))
+
+    def publish(self, name: str, content: bytes | None) -> None:
+        """Keep the newest frame until it is taken."""
+        self._live[name] = content
+
+    def take_live(self) -> dict[str, bytes | None]:
+        """The newest frame, unless it was taken before."""
+        taken, self._live = self._live, {}
+        return taken
 
     def write_conditions(self, conditions: dict[str, Any]) -> None:
         """Report what the episodes run under."""
@@ -243,7 +255,7 @@ class EpisodeActor:
         self._steps, now = progress.steps, time.monotonic()
         if now - self._reported >= _PROGRESS_S:
             self._reported = now
-            self._outbox.reports.put(Report(steps=self._steps))
+            self._outbox.reports.put(Report(steps=self._steps, live=self._outbox.take_live()))
 
     def _close(self) -> None:
         if self._loop is not None:
