@@ -16,15 +16,17 @@ import numpy.typing as npt
 
 from vecenv.manipulation.world import matrix
 from vecenv.observations import ObjectsSnapshot
+from voxposer.arguments import finite_in_single, number, numbers, plain_array, shown, text
 from voxposer.language.observations import Observation
 from voxposer.perception.observation import LazyObservation
 from voxposer.perception.view import HAND_ALIASES, Perception
-from voxposer.quaternions import euler2quat, pointat2quat, qinverse, qmult, quat2euler, quaternion, unit, vector3
+from voxposer.quaternions import euler2quat, pointat2quat, qinverse, qmult, quat2euler, quaternion, unit
 from voxposer.requests import InterfaceError, MotionRequest
+from voxposer.sandbox.guard import Kept, Record, RecordList
 
 T = TypeVar("T")
-# Distances and indices of programs stay below this.
-_FAR = 1e6
+# Motions that the programs of one subtask may ask for.
+MOST_MOTIONS = 50
 # What programs give to ``execute``: a value, or a function that computes it from the present state.
 Observed = Observation | Callable[[], Observation]
 VoxelMap = npt.ArrayLike | Callable[[], npt.ArrayLike]
@@ -77,7 +79,7 @@ class Interface:
 
     def functions(self) -> dict[str, Callable[..., Any]]:
         """Every function that programs may call, by name."""
-        named = (self.detect, self.execute, self.reset_to_default_pose, self.get_ee_pos, self.cm2index, self.index2cm)
+        named = (self.detect, self.reset_to_default_pose, self.get_ee_pos, self.cm2index, self.index2cm)
         empty = {
             f"get_empty_{kind}_map": getattr(self, f"_empty_{kind}")
             for kind in ("affordance", "avoidance", "rotation", "velocity", "gripper")
@@ -85,13 +87,14 @@ class Interface:
         turning = {"pointat2quat": pointat2quat, "vec2quat": pointat2quat, "euler2quat": euler2quat}
         turning |= {"quat2euler": quat2euler, "qmult": qmult, "qinverse": qinverse}
         turning |= {"normalize_vector": normalize_vector, "normalize_map": normalize_map}
-        return {**{f.__name__: f for f in named}, "set_voxel_by_radius": self.set_voxel_by_radius, **empty, **turning}
+        others = {"execute": self._execute_kept, "set_voxel_by_radius": self.set_voxel_by_radius}
+        return {**{f.__name__: f for f in named}, **others, **empty, **turning}
 
     # -- looking -------------------------------------------------------------------------------------------------------
 
     def detect(self, name: str) -> LazyObservation:
         """Observation of an object, a part, or one of the aliases of hand and table."""
-        return self.perception.detect(name)
+        return self.perception.detect(text(name, "name"))
 
     def get_ee_pos(self) -> np.ndarray:
         """Voxel of the hand, int [3]."""
@@ -100,16 +103,15 @@ class Interface:
     def cm2index(self, cm: float, direction: npt.ArrayLike) -> Any:
         """Centimetres as voxels along ``"x"``, ``"y"``, ``"z"`` (int), or along a vector [3] (int [3])."""
         size = self.perception.grid.resolution * 100
-        _require_distance(cm, "cm")
+        cm = number(cm, "cm")
         if isinstance(direction, str):
             return int(cm / size[_axis(direction)])
-        vector = vector3(direction, "direction")
-        return (cm * unit(vector) / size).astype(int)
+        return (cm * unit(numbers(direction, "direction", (3,))) / size).astype(int)
 
     def index2cm(self, index: float, direction: str | None = None) -> float:
         """Voxels as centimetres along an axis, or along the average axis."""
         size = self.perception.grid.resolution * 100
-        _require_distance(index, "index")
+        index = number(index, "index")
         return index * float(size.mean() if direction is None else size[_axis(direction)])
 
     # -- maps ----------------------------------------------------------------------------------------------------------
@@ -119,10 +121,16 @@ class Interface:
     ) -> np.ndarray:
         """Set the voxels within a box of half edge ``radius_cm`` around a voxel (upstream's, for a ball)."""
         size = self.perception.grid.size
-        centre = np.clip(np.round(vector3(voxel_xyz, "voxel_xyz")).astype(int), 0, size - 1)
-        reach = np.array([self.cm2index(max(radius_cm, 0), axis) for axis in "xyz"])
+        if not isinstance(voxel_map, np.ndarray) or voxel_map.shape not in (self._shape, (*self._shape, 4)):
+            raise InterfaceError(
+                f"voxel_map: expected a map {[*self._shape]} or {[*self._shape, 4]}, got {shown(voxel_map)}"
+            )
+        shapes: tuple[tuple[int, ...], ...] = ((),) if voxel_map.ndim == 3 else ((), (4,))
+        content = numbers(value, "value", *shapes)
+        centre = np.clip(np.round(numbers(voxel_xyz, "voxel_xyz", (3,))), 0, size - 1).astype(int)
+        reach = np.array([self.cm2index(max(number(radius_cm, "radius_cm"), 0), axis) for axis in "xyz"])
         low, high = np.maximum(centre - reach, 0), np.minimum(centre + reach + 1, size)
-        voxel_map[low[0] : high[0], low[1] : high[1], low[2] : high[2]] = value
+        voxel_map[low[0] : high[0], low[1] : high[1], low[2] : high[2]] = content
         return voxel_map
 
     def _empty_affordance(self) -> np.ndarray:
@@ -167,13 +175,15 @@ class Interface:
             affordance_map: 1 at targets, [N, N, N]; without it the hand stays where it is.
             avoidance_map: 0 (free) to 1, [N, N, N].
             rotation_map: wxyz, world frame, [N, N, N, 4].
-            velocity_map: 1 is full speed, [N, N, N].
+            velocity_map: 1 is full speed, nothing below 0, [N, N, N].
             gripper_map: 1 open, 0 closed, [N, N, N].
 
         Raises:
             InterfaceError: something else as ``movable``, a map of another shape or with values beyond single
-                precision, an affordance map without targets, an object to push without one, or one that is fixed.
+                precision, an affordance map without targets, an object to push without one, or one that is fixed;
+                more motions than a subtask may have.
         """
+        self._require_few()
         seen = _seen(movable)
         name = str(seen["name"])
         object_centric = name.lower() not in HAND_ALIASES
@@ -189,15 +199,25 @@ class Interface:
             avoidance=None if avoidance_map is None else self._avoidance(avoidance_map),
             occupancy=np.asarray(seen["occupancy_map"]) > 0.5 if object_centric else None,
             rotation=self._rotation(rotation_map),
-            velocity=_folded(np.float32(1.0) if velocity_map is None else self._map(velocity_map, "velocity map")),
+            velocity=self._velocity(velocity_map),
             gripper=self._gripper(gripper_map),
         )
         self.requests.append(request)
         if not object_centric:
             self._advance_hand(request)
 
+    def _execute_kept(self, *arguments: Any, **named: Any) -> Kept:
+        """``execute`` for programs, which have to pay for the memory of its maps."""
+        self.execute(*arguments, **named)
+        return Kept(self.requests[-1].nbytes)
+
+    def _require_few(self) -> None:
+        if len(self.requests) >= MOST_MOTIONS:
+            raise InterfaceError(f"more than {MOST_MOTIONS} motions in one subtask")
+
     def reset_to_default_pose(self) -> None:
         """Ask for the hand to go where it was when the episode began, the grip as it is."""
+        self._require_few()
         home = self.perception.hand.home
         voxel = self.perception.grid.voxel(home[:3])
         grip = np.asarray(0.0 if self._closed else 1.0)
@@ -234,12 +254,13 @@ class Interface:
             raise InterfaceError(f"{name} cannot be pushed: it is fixed")
 
     def _map(self, given: VoxelMap, what: str, *tail: int) -> np.ndarray:
-        value = np.asarray(_now(given))
+        now = _now(given)
+        if isinstance(now, (Record, RecordList)):
+            raise InterfaceError(f"the {what} is an observation; expected a map {(*self._shape, *tail)}")
+        value = plain_array(now, f"the {what}")
         if value.shape != (*self._shape, *tail):
             raise InterfaceError(f"the {what} has shape {value.shape}; expected {(*self._shape, *tail)}")
-        with np.errstate(over="ignore"):
-            finite = np.isfinite(value.astype(np.float32)).all()
-        if not finite:
+        if not finite_in_single(value):
             raise InterfaceError(f"the {what} holds values that are not finite in single precision")
         return value
 
@@ -251,6 +272,12 @@ class Interface:
         if given is None:
             return quaternion(self.perception.ee.rotation)
         return _folded(self._map(given, "rotation map", 4), tail=1)
+
+    def _velocity(self, given: VoxelMap | None) -> np.ndarray:
+        value = np.asarray(1.0) if given is None else self._map(given, "velocity map")
+        if (value < 0).any():
+            raise InterfaceError("the velocity map holds values below 0")
+        return _folded(value)
 
     def _gripper(self, given: VoxelMap | None) -> np.ndarray:
         if given is None:
@@ -270,30 +297,21 @@ def _seen(movable: Observed) -> Observation:
         return seen
     if isinstance(seen, Sequence) and not isinstance(seen, str):
         raise InterfaceError(f"movable: {len(seen)} things; call execute for each of them")
-    kind = type(seen).__name__
-    raise InterfaceError(f"movable: expected an observation from parse_query_obj or detect, got a value of type {kind}")
-
-
-def _require_distance(value: object, what: str) -> None:
-    """Refuse what is no distance in a workspace."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise InterfaceError(f"{what}: expected a number, got a value of type {type(value).__name__}")
-    if not abs(value) < _FAR:  # also what is not a number
-        raise InterfaceError(f"{what}: expected a number between -{_FAR:.0f} and {_FAR:.0f}, got {value:g}")
+    raise InterfaceError(f"movable: expected an observation from parse_query_obj or detect, got {shown(seen)}")
 
 
 def normalize_vector(x: npt.ArrayLike) -> np.ndarray:
     """A vector [3], or rows of vectors [N, 3], scaled to length 1; zero for one shorter than 1e-6."""
-    vectors = np.asarray(x, float)
-    if vectors.ndim not in (1, 2):
-        raise InterfaceError(f"normalize_vector takes a vector or rows of vectors, not the shape {vectors.shape}")
+    vectors = numbers(x, "normalize_vector", (3,), (None, 3))
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), 0.0)
 
 
 def normalize_map(map: npt.ArrayLike) -> np.ndarray:
     """A map scaled to 0..1; as it is where all its values are equal."""
-    values = np.asarray(map, float)
+    values = numbers(map, "normalize_map")
+    if not values.size:
+        raise InterfaceError("normalize_map: expected numbers, got none")
     low, high = float(values.min()), float(values.max())
     return values if high == low else (values - low) / (high - low)
 
@@ -308,6 +326,6 @@ def _folded(volume: npt.ArrayLike, tail: int = 0) -> np.ndarray:
 
 
 def _axis(direction: str) -> int:
-    if direction not in ("x", "y", "z"):
-        raise InterfaceError(f"direction {direction!r}: expected 'x', 'y', 'z' or a vector of 3 numbers")
+    if not isinstance(direction, str) or direction not in ("x", "y", "z"):
+        raise InterfaceError(f"direction: expected 'x', 'y', 'z' or a vector of 3 numbers, got {shown(direction)}")
     return "xyz".index(direction)

@@ -7,8 +7,10 @@ not given has no effect.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+import logging
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,6 +23,8 @@ from voxposer.planning.config import Fault, PlannerConfig
 from voxposer.planning.planner import optimize_paths
 from voxposer.requests import InterfaceError, MotionRequest
 
+T = TypeVar("T")
+_log = logging.getLogger(__name__)
 # Paths planned at once: few shapes to compile for, and a bound on memory (a float64 volume of a path is 8 MB).
 CHUNK = 8
 
@@ -63,28 +67,51 @@ def plan_paths(
                     continue
                 found = _mapped(*wants[i], then[i] if then else None, config, route)
                 paths[i], kept[i] = found.path, PlannedOn(found.avoidance, found.value)
-            except InterfaceError as error:
-                paths[i] = error
+            except Exception as error:
+                paths[i] = _as_interface_error(error)
             asking.remove(i)
     for first in range(0, len(asking), CHUNK):
         chunk = asking[first : first + CHUNK]
         obstacles, refused = _obstacle_maps([wants[i] for i in chunk], route)
-        for i, path in zip(chunk, _planned([wants[i] for i in chunk], obstacles, refused, config), strict=True):
-            paths[i] = path
+        planned = each_alone(partial(_planned, config=config), [wants[i] for i in chunk], obstacles)
+        for number, (i, path) in enumerate(zip(chunk, planned, strict=True)):
+            paths[i] = refused.get(number) or (_as_interface_error(path) if isinstance(path, Exception) else path)
         if maps_of is not None:
             kept |= {i: PlannedOn(each) for i, each in zip(chunk, obstacles, strict=True)}
     return paths
 
 
+def each_alone(plan: Callable[..., Sequence[T]], *rows: Sequence[Any]) -> list[T | Exception]:
+    """What a function makes of rows that belong to different slots: in one call, or, if that fails, row by row.
+
+    A slot that nothing can be planned for is then the only one that has no result.
+
+    Args:
+        plan: takes a list of each kind of row, and gives a result for each row.
+        rows: of each kind, one a slot.
+    """
+    if not rows[0]:
+        return []
+    try:
+        return list(plan(*rows))
+    except Exception as error:
+        if len(rows[0]) == 1:
+            return [error]
+        return [found for row in zip(*rows, strict=True) for found in each_alone(plan, *([each] for each in row))]
+
+
+def _as_interface_error(error: Exception) -> InterfaceError:
+    if isinstance(error, InterfaceError):
+        return error
+    _log.error("planning failed", exc_info=error)
+    return InterfaceError(f"planning failed: {type(error).__name__}: {error}")
+
+
 def _planned(
-    wants: Sequence[tuple[Interface, MotionRequest]],
-    obstacles: Sequence[np.ndarray],
-    refused: Mapping[int, InterfaceError],
-    config: PlannerConfig,
+    wants: Sequence[tuple[Interface, MotionRequest]], obstacles: Sequence[np.ndarray], *, config: PlannerConfig
 ) -> list[np.ndarray | InterfaceError]:
     if config.method == "straight":
-        straight = [straight_path(start_of(*want), want[1], config) for want in wants]
-        return [refused.get(i, path) for i, path in enumerate(straight)]
+        return [straight_path(start_of(*want), want[1], config) for want in wants]
     padded = [*wants, *[wants[-1]] * ((1 if len(wants) == 1 else CHUNK) - len(wants))]
     starts = np.stack([start_of(interface, request) for interface, request in padded])
     obstacles = [*obstacles, *[obstacles[-1]] * (len(padded) - len(wants))]
@@ -97,9 +124,7 @@ def _planned(
     )
     lengths, path, fault = (np.asarray(x) for x in (found.path_length, found.path, found.fault))
     return [
-        refused[i]
-        if i in refused
-        else path[i, : lengths[i]].astype(float)
+        path[i, : lengths[i]].astype(float)
         if lengths[i]
         else InterfaceError(f"no path to the targets: {Fault(int(fault[i])).name.lower().replace('_', ' ')}")
         for i in range(len(wants))
@@ -115,8 +140,8 @@ def _obstacle_maps(
     for i, (interface, request) in enumerate(wants):
         try:
             made.append(obstacle_map(interface.perception, request, route))
-        except InterfaceError as error:
-            refused[i] = error
+        except Exception as error:
+            refused[i] = _as_interface_error(error)
             made.append(np.zeros((interface.perception.grid.size,) * 3))
     return made, refused
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vecenv.manipulation.world import matrix
+from voxposer.arguments import number, numbers
 from voxposer.requests import InterfaceError
 
 
@@ -31,18 +32,6 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     return -q if q[0] < 0 else q
 
 
-def vector3(value: npt.ArrayLike, what: str) -> np.ndarray:
-    """A vector of 3 finite numbers.
-
-    Raises:
-        InterfaceError: it is something else; ``what`` names it.
-    """
-    vector = np.asarray(value, float)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise InterfaceError(f"{what}: expected 3 finite numbers, got {value!r}")
-    return vector
-
-
 def unit(vector: np.ndarray) -> np.ndarray:
     """The vector [3] scaled to length 1; zero for one that is shorter than 1e-6."""
     length = float(np.linalg.norm(vector))
@@ -51,7 +40,7 @@ def unit(vector: np.ndarray) -> np.ndarray:
 
 def pointat2quat(vector: npt.ArrayLike) -> np.ndarray:
     """Rotation wxyz [4] of a hand whose fingers point along ``vector`` [3], its x axis as near world x as it can be."""
-    z = unit(vector3(vector, "vector"))
+    z = unit(numbers(vector, "vector", (3,)))
     if not z.any():
         raise InterfaceError("vector: a direction needs a length")
     aside = np.array([0.0, 1.0, 0.0]) if abs(z[0]) > 0.99 else np.array([1.0, 0.0, 0.0])
@@ -61,8 +50,12 @@ def pointat2quat(vector: npt.ArrayLike) -> np.ndarray:
 
 def qmult(q: npt.ArrayLike, r: npt.ArrayLike) -> np.ndarray:
     """Product of quaternions wxyz: first ``r``, then ``q``."""
-    a, b, c, d = np.asarray(q, float)
-    w, x, y, z = np.asarray(r, float)
+    return _product(numbers(q, "q", (4,)), numbers(r, "r", (4,)))
+
+
+def _product(q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    a, b, c, d = q
+    w, x, y, z = r
     return np.array(
         [
             a * w - b * x - c * y - d * z,
@@ -75,21 +68,25 @@ def qmult(q: npt.ArrayLike, r: npt.ArrayLike) -> np.ndarray:
 
 def qinverse(q: npt.ArrayLike) -> np.ndarray:
     """Inverse of a quaternion wxyz."""
-    quat = np.asarray(q, float)
+    quat = numbers(q, "q", (4,))
     return quat * [1, -1, -1, -1] / max(float(quat @ quat), 1e-12)
 
 
 def euler2quat(roll: float, pitch: float, yaw: float) -> np.ndarray:
     """Quaternion wxyz of turns about the world's x, then y, then z axis, radians."""
-    turns = [np.array([np.cos(a / 2), 0.0, 0.0, 0.0]) for a in (roll, pitch, yaw)]
-    for i, angle in enumerate((roll, pitch, yaw)):
+    angles = [number(angle, name) for angle, name in ((roll, "roll"), (pitch, "pitch"), (yaw, "yaw"))]
+    turns = [np.array([np.cos(a / 2), 0.0, 0.0, 0.0]) for a in angles]
+    for i, angle in enumerate(angles):
         turns[i][1 + i] = np.sin(angle / 2)
-    return qmult(turns[2], qmult(turns[1], turns[0]))
+    return _product(turns[2], _product(turns[1], turns[0]))
 
 
 def quat2euler(quat: npt.ArrayLike) -> np.ndarray:
     """Roll, pitch, yaw [3] in radians of a quaternion wxyz, the inverse of :func:`euler2quat`."""
-    q = np.asarray(quat, float)
-    m = matrix(q / np.linalg.norm(q))
+    q = numbers(quat, "quat", (4,))
+    length = np.linalg.norm(q)
+    if length < 1e-6:
+        raise InterfaceError("quat: a quaternion of length zero is no rotation")
+    m = matrix(q / length)
     pitch = np.arcsin(np.clip(-m[2, 0], -1.0, 1.0))
     return np.array([np.arctan2(m[2, 1], m[2, 2]), pitch, np.arctan2(m[1, 0], m[0, 0])])

@@ -47,6 +47,12 @@ class MotionRequest:
     velocity: np.ndarray
     gripper: np.ndarray
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its maps."""
+        maps = (self.targets, self.avoidance, self.occupancy, self.rotation, self.velocity, self.gripper)
+        return sum(each.nbytes for each in maps if each is not None)
+
     def rotation_at(self, voxel: np.ndarray) -> np.ndarray:
         """Rotation wanted at a voxel, unit quaternion wxyz [4]."""
         quat = np.asarray(self.rotation if self.rotation.ndim == 1 else self.rotation[tuple(voxel)], float)

@@ -14,6 +14,7 @@ verdict (``Slot.error``). The programs of a call are run side by side, so that s
 from __future__ import annotations
 
 import json
+import logging
 import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,9 +34,8 @@ from voxposer.language.llm import Llm
 from voxposer.language.lmp import build_lmps
 from voxposer.language.lmp_config import CONFIGS, Call, LmpConfig
 from voxposer.language.replies import LlmError
-from voxposer.paths import PlannedOn, plan_paths
+from voxposer.paths import PlannedOn, each_alone, plan_paths
 from voxposer.perception.config import HandState, PerceptionConfig
-from voxposer.perception.observation import PerceptionError
 from voxposer.perception.view import Perception
 from voxposer.planned import PlannedMotion, PlannedSubtasks, Subtasks
 from voxposer.planning.config import PlannerConfig
@@ -43,17 +43,21 @@ from voxposer.planning.plan import PlanConfig
 from voxposer.pushing import PushingConfig, PushSituation
 from voxposer.quaternions import quaternion
 from voxposer.requests import InterfaceError, MotionRequest
-from voxposer.sandbox.guard import HostFault, Limits
+from voxposer.sandbox.guard import HostFault, Limits, shortened
 from voxposer.slots import Grasp, Latest, Moving, Pushing, Ready, Slot, pending
 from voxposer.stops import stops_of, travel
 from voxposer.turns import Turns, TurnsOver
 
 # Episodes that are open at once.
 MOST_EPISODES = 4096
+# Characters of the cause of a slot that is stopped.
+_CAUSE = 2000
 # A motion has reached its targets within this many voxels, as upstream's ``execute`` has it.
 _REACHED = 2.0
-# Errors of a program, of what it asked for, or of what it looked for: they stop a slot.
-_STOPS_A_SLOT = (HostFault, PerceptionError, InterfaceError)
+# Errors of a program, of what it asked for, or of what it looked for: they stop a slot. So does any other, which is
+# logged as well, because this package is then to blame.
+_EXPECTED = (HostFault, VecenvError)
+_log = logging.getLogger(__name__)
 
 
 class HandleError(InvalidInput):
@@ -227,7 +231,7 @@ class Runtimes:
             slot.progress = replace(slot.progress, subtasks=slot.lmps.plan(instruction))
             if not slot.progress.has_next:
                 slot.stop("the planner found nothing to do")
-        except (LlmError, *_STOPS_A_SLOT) as error:
+        except Exception as error:
             _end_with(slot, error)
 
     def _together(self, slots: Sequence[Slot], jobs: Sequence[Callable[[], None]]) -> None:
@@ -267,7 +271,7 @@ class Runtimes:
                 slot.enter(pending(slot.phase.requests))
             if again:
                 self._end_motion(slot)
-        except _STOPS_A_SLOT as error:
+        except Exception as error:
             _stop_with(slot, error)
 
     def _end_motion(self, slot: Slot) -> None:
@@ -369,14 +373,17 @@ class Runtimes:
                 requests = tuple(slot.interface.taken())
                 if requests:
                     slot.enter(Moving(requests))
-        except (LlmError, *_STOPS_A_SLOT) as error:
+        except Exception as error:
             _end_with(slot, error)
 
     def _plan(self, slots: Sequence[Slot]) -> list[list[list[Stop]]]:
         """The motions of every slot that its programs asked for, each a list of stops."""
         motions: list[list[list[Stop]]] = [[] for _ in slots]
         for slot in slots:
-            _return_hand(slot)
+            try:
+                _return_hand(slot)
+            except Exception as error:
+                _stop_with(slot, error)
         waiting = [i for i, slot in enumerate(slots) if isinstance(slot.phase, Moving)]
         while waiting:
             wants = [(slots[i].interface, slots[i].requests[0]) for i in waiting]
@@ -394,36 +401,39 @@ class Runtimes:
         self, row: int, slot: Slot, path: np.ndarray | InterfaceError, maps: PlannedOn | None
     ) -> list[Stop]:
         """Stops of a slot's next motion; the hand is then taken to be at its end."""
-        assert isinstance(slot.phase, Moving)
-        perception, request, rest = slot.interface.perception, slot.requests[0], slot.requests[1:]
+        perception, request, grip = slot.interface.perception, slot.requests[0], slot.grip.closed
         slot.latest = replace(slot.latest, movable=request.movable, object_centric=request.object_centric)
         start = np.concatenate([perception.ee.pos, quaternion(perception.ee.rotation)])
-        stops: list[Stop] = []
         try:
-            if isinstance(path, InterfaceError):
-                raise path
-            if not request.object_centric:
-                stops = stops_of(request, path, perception, self.config.route, closed=slot.grip.closed)
-                stops = stops[: self.config.num_waypoints_per_plan]
-            else:
-                push = pushing.task_of(request.movable, perception.grid.world(path), perception)
-        except VecenvError as error:
+            stops = self._begun(slot, path)
+        except Exception as error:
             _stop_with(slot, error)
             return []
         if self._on_planned:
             number, text = slot.progress.number, slot.progress.text
             obstacles, value = maps or (None, None)
-            shown = (np.asarray(path), tuple(stops), obstacles, start, slot.grip.closed, slot.latest.calls, value)
+            shown = (np.asarray(path), tuple(stops), obstacles, start, grip, slot.latest.calls, value)
             self._on_planned(PlannedMotion(row, number, text, request, perception, *shown))
+        if stops:
+            perception.move_hand(stops[-1].pos, matrix(stops[-1].quat), closed=slot.grip.closed)
+        return stops
+
+    def _begun(self, slot: Slot, path: np.ndarray | InterfaceError) -> list[Stop]:
+        """Stops of a slot's next motion, which it enters; none where an object is to be pushed."""
+        assert isinstance(slot.phase, Moving)
+        perception, request, rest = slot.interface.perception, slot.requests[0], slot.requests[1:]
+        if isinstance(path, InterfaceError):
+            raise path
         if request.object_centric:
-            slot.enter(Pushing(push, rest))
+            slot.enter(Pushing(pushing.task_of(request.movable, perception.grid.world(path), perception), rest))
             return []
+        stops = stops_of(request, path, perception, self.config.route, closed=slot.grip.closed)
+        stops = _finite(stops[: self.config.num_waypoints_per_plan])
         if request.kind == "path":
             _remember_grasp(slot, request, path[-1])
         again = request.kind == "path" and self.config.max_plan_iter > 1
         slot.enter(replace(slot.phase, iterations=slot.phase.iterations + 1) if again else pending(rest))
         slot.close_grip(stops[-1].closed)
-        perception.move_hand(stops[-1].pos, matrix(stops[-1].quat), closed=slot.grip.closed)
         return stops
 
     def _plan_pushes(
@@ -431,11 +441,17 @@ class Runtimes:
     ) -> None:
         """The next push of every slot that pushes, searched for all in one call."""
         found = [(slot, situation) for slot in pushing_slots if (situation := self._situation(slot))]
-        pushes = pushing.next_pushes([situation for _, situation in found], self.config.push)
+        pushes = each_alone(lambda chosen: pushing.next_pushes(chosen, self.config.push), [each for _, each in found])
         for (slot, _), stops in zip(found, pushes, strict=True):
-            perception = slot.interface.perception
-            here = Stop(perception.ee.pos, quaternion(perception.ee.rotation), True)
-            way = [*travel([here, stops[0]], perception, self.config.route), *stops[1:]]
+            try:
+                if isinstance(stops, Exception):
+                    raise stops
+                perception = slot.interface.perception
+                here = Stop(perception.ee.pos, quaternion(perception.ee.rotation), True)
+                way = _finite([*travel([here, stops[0]], perception, self.config.route), *stops[1:]])
+            except Exception as error:
+                _stop_with(slot, error)
+                continue
             motions[slots.index(slot)].append(way)
             slot.close_grip(way[-1].closed)
 
@@ -444,7 +460,7 @@ class Runtimes:
         assert isinstance(slot.phase, Pushing)
         try:
             return pushing.situation(slot.phase.task, slot.interface.perception, self.config.push)
-        except VecenvError as error:
+        except Exception as error:
             _stop_with(slot, error)
             return None
 
@@ -476,7 +492,20 @@ def _return_hand(slot: Slot) -> None:
         slot.interface.perception.move_hand(ee[:3], matrix(ee[3:]), closed=slot.grip.closed)
 
 
+def _finite(stops: list[Stop]) -> list[Stop]:
+    """Stops, if the hand can be sent to them."""
+    if not all(np.isfinite([*stop.pos, *stop.quat, stop.velocity]).all() for stop in stops):
+        raise InterfaceError("the motion has a pose or a velocity that is not finite")
+    return stops
+
+
 def _stop_with(slot: Slot, error: Exception) -> None:
+    """Stop a slot, and no other, for an error in its program or in planning what that asked for."""
+    if not isinstance(error, _EXPECTED):
+        _log.error("a slot was stopped by an unexpected error", exc_info=error)
+    slot.interface.taken()  # what its programs asked for so far is never planned
+    if slot.cause:
+        return
     slot.stop(f"{slot.missing} ({_described(error)})" if slot.missing else _described(error))
 
 
@@ -491,7 +520,7 @@ def _end_with(slot: Slot, error: Exception) -> None:
 
 
 def _described(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+    return shortened(f"{type(error).__name__}: {error}", _CAUSE)
 
 
 def _settle(calls: Sequence[Call]) -> None:

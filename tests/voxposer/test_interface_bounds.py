@@ -12,10 +12,11 @@ from support.voxposer_world import HOME, Obedient, box, snapshot
 
 from vecenv.contract import BatchEnv
 from voxposer.agent import Agent, AgentConfig
-from voxposer.interface import Interface, normalize_map, normalize_vector
+from voxposer.interface import MOST_MOTIONS, Interface, normalize_map, normalize_vector
 from voxposer.language.observations import DynamicObservations
 from voxposer.perception.config import HandState
 from voxposer.perception.view import Perception
+from voxposer.quaternions import euler2quat, pointat2quat, qmult
 from voxposer.requests import InterfaceError
 
 CUBE = {"cube_1": box((0.02, 0.02, 0.02), (0.2, 0.1, 0.02))}
@@ -57,6 +58,9 @@ def test_several_things_are_moved_one_by_one() -> None:
     [
         ("rotation_map", np.full((*SHAPE, 4), 1e300), "rotation map holds values that are not finite in single"),
         ("velocity_map", np.full(SHAPE, np.inf), "velocity map holds values that are not finite in single"),
+        ("velocity_map", np.full(SHAPE, -0.5), "velocity map holds values below 0"),
+        ("velocity_map", np.full(SHAPE, "fast"), "velocity map: expected numbers, got an array"),
+        ("avoidance_map", [[1], [1, 2]], "avoidance map: expected numbers in rows of one length, got a list of 2"),
         ("velocity_map", np.full(SHAPE, 1e39), "velocity map holds values that are not finite in single"),
         ("gripper_map", np.full(SHAPE, np.nan), "gripper map holds values that are not finite in single"),
         ("avoidance_map", np.full(SHAPE, -1e200), "avoidance map holds values that are not finite in single"),
@@ -88,12 +92,52 @@ def test_distances_are_numbers_of_a_workspace(cm: Any) -> None:
         interface.index2cm(cm)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("value", [1e300, float("nan"), "abcd", None, np.zeros((4, 9, 1)), [[1], [1, 2]], {"w": 1}])
+def test_rotations_are_made_of_finite_numbers_of_one_shape(value: Any) -> None:
+    with pytest.raises(InterfaceError, match=r"^q: expected"):
+        qmult([value] * 4 if isinstance(value, float) else value, [1, 0, 0, 0])
+    with pytest.raises(InterfaceError, match=r"^roll: expected a number"):
+        euler2quat(value, 0, 0)
+    with pytest.raises(InterfaceError, match=r"^vector: expected"):
+        pointat2quat([value] * 3 if isinstance(value, float) else value)
+
+
+def test_a_subtask_has_so_many_motions() -> None:
+    interface = begin()
+    for _ in range(MOST_MOTIONS):
+        interface.reset_to_default_pose()
+    with pytest.raises(InterfaceError, match="more than 50 motions"):
+        interface.reset_to_default_pose()
+    with pytest.raises(InterfaceError, match="more than 50 motions"):
+        interface.execute(interface.detect("gripper"), target())
+    interface.restart()
+    interface.reset_to_default_pose()
+
+
+def test_the_maps_of_a_motion_count_for_the_program_that_asked() -> None:
+    interface = begin()
+    kept = interface.functions()["execute"](interface.detect("gripper"), target(), target())
+    assert kept == interface.requests[0].nbytes > 5 * 10**6
+
+
+def test_a_motion_keeps_no_array_that_its_program_can_change() -> None:
+    interface = begin()
+    maps = {"affordance_map": target(), "avoidance_map": target(), "gripper_map": target(), "velocity_map": target()}
+    maps |= {"rotation_map": np.concatenate([np.ones((50, 100, 100, 4)), np.full((50, 100, 100, 4), 2.0)])}
+    for dtype in (np.float64, np.float32):
+        given = {name: value.astype(dtype) for name, value in maps.items()}
+        interface.execute(interface.detect("gripper"), **given)
+        kept = [value for value in vars(interface.requests[-1]).values() if isinstance(value, np.ndarray)]
+        assert not any(np.shares_memory(mine, theirs) for mine in given.values() for theirs in kept)
+
+
 def test_vectors_and_maps_are_scaled_as_upstreams_helpers_do() -> None:
     np.testing.assert_allclose(normalize_vector([3, 0, 4]), [0.6, 0, 0.8])
     np.testing.assert_allclose(normalize_vector([[0, 0, 2], [0, 0, 0]]), [[0, 0, 1], [0, 0, 0]])
     np.testing.assert_allclose(normalize_map([1, 3, 2]), [0, 1, 0.5])
     np.testing.assert_allclose(normalize_map([2, 2]), [2, 2])
-    with pytest.raises(InterfaceError, match="a vector or rows of vectors"):
+    with pytest.raises(InterfaceError, match="expected 3 numbers or rows of 3 numbers, got 3"):
         normalize_vector(3)
 
 

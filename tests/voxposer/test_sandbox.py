@@ -16,7 +16,7 @@ from support.hostile_programs import HEAVY, HOSTILE
 from support.paths import TESTS
 from support.sandbox_runs import FUNCTIONS, refusal, run, variables
 
-from voxposer.sandbox.guard import Budget, HostFault, Limits
+from voxposer.sandbox.guard import Budget, HostFault, Kept, Limits
 from voxposer.sandbox.interpreter import parse
 from voxposer.sandbox.syntax import RULES, SandboxError
 
@@ -118,16 +118,91 @@ def test_a_program_is_stopped_at_its_time_limit() -> None:
     assert error.line in (1, 2)
 
 
-def test_time_in_host_functions_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr("voxposer.sandbox.guard.time.monotonic", lambda: now[0])
+def test_computing_in_host_functions_counts_and_waiting_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    spent, passed = [0.0], [0.0]
+    monkeypatch.setattr("voxposer.sandbox.guard.time.thread_time", lambda: spent[0])
+    monkeypatch.setattr("voxposer.sandbox.guard.time.monotonic", lambda: passed[0])
 
-    def slow() -> int:
-        now[0] += 3600
+    def wait() -> int:
+        passed[0] += 3600
         return 1
 
-    source = "x = slow()\nfor i in range(2000):\n    x += 1"
-    assert parse(source).run({"slow": slow}).variables["x"] == 2001
+    def compute() -> int:
+        passed[0] += 6
+        spent[0] += 6
+        return 1
+
+    functions = {"wait": wait, "compute": compute}
+    source = "x = wait()\nfor i in range(2000):\n    x += 1"
+    assert parse(source).run(functions).variables["x"] == 2001
+    with pytest.raises(SandboxError, match=r"more than 10\.0 s of computing") as caught:
+        parse("for i in range(9):\n    try: compute()\n    except Exception: pass").run(functions)
+    assert (caught.value.rule, spent[0]) == ("time", 12.0)
+
+
+def test_the_model_is_asked_off_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    spent = [0.0]
+    monkeypatch.setattr("voxposer.sandbox.guard.time.thread_time", lambda: spent[0])
+    budget = Budget(Limits())
+
+    def ask() -> int:
+        with budget.clock(running=False):
+            spent[0] += 3600
+        return 1
+
+    assert parse("x = ask()\nfor i in range(999): x += 1").run({"ask": ask}, budget=budget).variables["x"] == 1000
+
+
+def test_nested_programs_share_memory_and_give_back_what_they_leave() -> None:
+    budget = Budget(Limits(memory_bytes=20_000_000))
+    inner = parse("x = np.zeros(2000000)")
+
+    def again() -> None:
+        inner.run({}, budget=budget)
+
+    parse("for i in range(9): again()").run({"again": again}, budget=budget)
+    assert budget.memory == 20_000_000
+    with pytest.raises(SandboxError, match="values of more than 20000000 bytes"):
+        parse("y = np.zeros(1000000)\nagain()").run({"again": again}, budget=budget)
+
+
+def test_what_the_host_keeps_is_the_programs_memory() -> None:
+    source = "for i in range(9):\n    x = keep()"
+    assert parse(source).run({"keep": lambda: Kept(1000)}).variables["x"] is None
+    with pytest.raises(SandboxError, match="values of more than") as caught:
+        parse(source, limits=Limits(memory_bytes=8000)).run({"keep": lambda: Kept(1000)})
+    assert caught.value.rule == "memory"
+
+
+def test_maps_of_a_program_that_failed_are_released_with_its_error() -> None:
+    import gc
+    import weakref
+
+    made: list[weakref.ref[Any]] = []
+
+    class Map(np.ndarray):
+        pass
+
+    def get_map() -> np.ndarray:
+        value = np.zeros((9, 9, 9)).view(Map)
+        made.append(weakref.ref(value))
+        return value
+
+    failing = (
+        "m = get_map()\nx = 1 / 0",
+        "m = get_map()\ntry: 1 / 0\nexcept Exception as e:\n    k = get_map()\n    raise",
+        "m = get_map()\ntry: 1 / 0\nexcept KeyError: pass\nfinally: k = get_map()",
+        "def g():\n    k = get_map()\n    yield k\nfor m in g(): raise ValueError",
+    )
+    gc.disable()
+    try:
+        for source in failing:
+            with pytest.raises(SandboxError):
+                parse(source).run({"get_map": get_map})
+    finally:
+        gc.enable()
+    assert made
+    assert [reference() is None for reference in made] == [True] * len(made)
 
 
 @given(st.text(alphabet="_.()[]{}:=,+*'\"\n fornixlambdapetcs0129@", max_size=60))

@@ -310,7 +310,7 @@ class Llm:
         sent, made = _tokens(response)
         unknown = self.config.is_rule_base or sent is None
         return Reply(
-            text=_until(stop, choices[0].message.content or ""),
+            text=_until(stop, _characters(choices[0].message.content or "")),
             model=response.model or self.config.model,
             finish_reason=choices[0].finish_reason or "stop",
             prompt_tokens=None if unknown else sent,
@@ -341,6 +341,11 @@ def _tokens(response: Response) -> tuple[int | None, int | None]:
     usage = getattr(response, "usage", None)
     sent, made = getattr(usage, "prompt_tokens", None), getattr(usage, "completion_tokens", None)
     return (sent, made) if sent else (None, None)
+
+
+def _characters(text: str) -> str:
+    """Text that can be written to files: JSON may hold halves of characters, which are put together or replaced."""
+    return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
 def _until(stop: Sequence[str], text: str) -> str:

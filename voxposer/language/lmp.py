@@ -37,13 +37,15 @@ from voxposer.language.observations import DynamicObservation, DynamicObservatio
 from voxposer.language.prompts import chat_messages, code_in, lines, load_prompts, query_line, repair_messages
 from voxposer.language.replies import LlmError, Message, NoRuleError, Reply
 from voxposer.sandbox import interpreter as sandbox
-from voxposer.sandbox.guard import Budget, HostFault, Limits, RecordList, kind_of
+from voxposer.sandbox.guard import Budget, HostFault, Limits, RecordList
 from voxposer.sandbox.interpreter import Program
 from voxposer.sandbox.syntax import SandboxError
 
 T = TypeVar("T")
 # Subtasks of one instruction, and characters of one query.
 _SUBTASKS, _QUERY_CHARS = 100, 1000
+# Characters of programs that are kept parsed: a syntax tree takes up to 350 bytes for each.
+_CACHED = 2000
 
 
 @dataclass(kw_only=True)
@@ -186,8 +188,8 @@ class Lmps:
 
     def _as_voxels(self, written: _Written, value: Any) -> np.ndarray:
         tail = (4,) if written.config.name == "get_rotation_map" else ()
-        shape = np.shape(value) if isinstance(value, np.ndarray) else (0,)
-        if shape != (shape[0],) * 3 + tail:
+        shape: tuple[int, ...] = value.shape if isinstance(value, np.ndarray) else ()
+        if shape != (shape[:1] or (0,)) * 3 + tail:
             wanted = "[N, N, N, 4]" if tail else "[N, N, N]"
             raise self._wrong(written, f"the program returned {_shown(value)}, not a map {wanted}")
         if not np.isfinite(value).all():
@@ -266,7 +268,7 @@ class Lmps:
     def _words(self, name: str, query: object) -> str:
         """A query as one line, without the full stop at its end."""
         if not isinstance(query, str):
-            raise LmpError(name, str(query)[:80], "query", f"a query is text, not {type(query).__name__}")
+            raise LmpError(name, "", "query", f"a query is text, not {_shown(query)}")
         words = " ".join(query.split()).rstrip(". ")
         if not words or len(words) > _QUERY_CHARS:
             raise LmpError(name, words[:80], "query", f"a query has 1 to {_QUERY_CHARS} characters, not {len(words)}")
@@ -313,7 +315,9 @@ class Lmps:
     def _parsed(self, call: Call, text: str) -> Program:
         call.code = code_in(text)
         try:
-            return _parse(call.code, self._limits)
+            with self._budget.clock(running=True) if self._budget else contextlib.nullcontext():
+                parse = _parse if len(call.code) <= _CACHED else _parse.__wrapped__
+                return parse(call.code, self._limits)
         except SandboxError as error:
             reason = f"{call.model} wrote a program that cannot be run: {error.reason}, in {_start(call.code)}"
             raise LmpError(call.lmp, call.query, error.rule, reason, error.line) from error
@@ -442,7 +446,7 @@ def build_lmps(
     return Lmps(functions, llm, load_prompts(prompts_dir), limits=limits, configs=configs, **options)
 
 
-@functools.lru_cache(maxsize=4096)
+@functools.lru_cache(maxsize=256)
 def _parse(code: str, limits: Limits) -> Program:
     """A parsed program, cached: the episodes of a batch share the same few."""
     return sandbox.parse(code, limits=limits)
@@ -475,9 +479,11 @@ def _static(value: object) -> Observation | None:
 def _shown(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"an array {list(value.shape)}"
-    if isinstance(value, (str, bool, int, float, list, tuple, dict, set)):
+    if isinstance(value, (str, bool, int, float)):
         return f"{type(value).__name__} {str(value)[:80]!r}"
-    return "nothing" if value is None else f"a value of kind {kind_of(value)}"
+    if isinstance(value, (list, tuple, dict, set)):  # whose items may be many more than it holds
+        return f"a {type(value).__name__} of {len(value)}"
+    return "nothing" if value is None else f"a value of type {type(value).__name__}"
 
 
 def _start(code: str) -> str:

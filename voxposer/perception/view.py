@@ -33,6 +33,8 @@ HAND_ALIASES = frozenset({"ee", "endeffector", "end_effector", "end effector", "
 TABLE_ALIASES = frozenset(
     {"table", "desk", "floor", "workstation", "work_station", "work station", "workspace", "work_space", "work space"}
 )
+# Characters of a name that is compared with those there are, or shown.
+_COMPARED = 60
 HELD_ALIASES = frozenset({"held object", "held_object", "object in hand", "held thing"})
 
 
@@ -103,8 +105,9 @@ class Perception:
             return self._observe_part(asked, self.snapshot.parts[asked])
         if asked in self.snapshot.objects:
             return self._observe_object(asked)
-        close = difflib.get_close_matches(asked, self.names, n=3) or self.names
-        raise PerceptionError(f"nothing here is called {asked!r}; did you mean {', '.join(close)}?")
+        close = difflib.get_close_matches(asked, self.names, n=3) if len(asked) <= _COMPARED else []
+        close = close or self.names
+        raise PerceptionError(f"nothing here is called {asked[:_COMPARED]!r}; did you mean {', '.join(close)}?")
 
     def position_of(self, voxel: np.ndarray) -> np.ndarray:
         """World position [3] of a voxel: the exact one of a grasp or place that was rounded to it, else its centre."""

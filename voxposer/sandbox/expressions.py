@@ -7,7 +7,6 @@ Out: values that the guard has accepted, or a ``SandboxError`` with the line of 
 from __future__ import annotations
 
 import ast
-import difflib
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -15,8 +14,19 @@ from typing import Any
 import numpy as np
 
 from voxposer.sandbox import formatting, indexing, modules, operators, values, vocabulary
-from voxposer.sandbox.guard import Guard, Opaque, Record, RecordList, Refusal, kind_of, shortened
+from voxposer.sandbox.guard import (
+    Guard,
+    HostFault,
+    Opaque,
+    Record,
+    RecordList,
+    Refusal,
+    about_arguments,
+    kind_of,
+    shortened,
+)
 from voxposer.sandbox.iteration import stream
+from voxposer.sandbox.modules import similar
 from voxposer.sandbox.numpy_functions import grid
 from voxposer.sandbox.objects import ERRORS, DType, Error, ErrorType, Function, Module, TypeName, error_class
 from voxposer.sandbox.python_functions import converted
@@ -30,7 +40,6 @@ _FAILURES: tuple[tuple[tuple[type[Exception], ...], str], ...] = (
     ((TypeError, AttributeError), "types"),
     ((ValueError, ArithmeticError, LookupError, BufferError), "value"),
 )
-_FAILURE_TYPES = tuple(kind for kinds, _ in _FAILURES for kind in kinds)
 # Where Python's own lines end; other separators of text are not ends of lines to it.
 _LINE_ENDS = re.compile(r"\r\n|\r|\n")
 
@@ -99,9 +108,9 @@ class Expressions:
         if isinstance(error, Refusal):
             caught = None if error.python is None else Error(error.python, _own_text(error.reason, error.python))
             return SandboxError(line, error.rule, f"{self._excerpt(line)}: {shortened(error.reason)}", caught)
-        if isinstance(error, SandboxError) or not isinstance(error, _FAILURE_TYPES):
+        if isinstance(error, (SandboxError, HostFault)):
             return error
-        rule = next(rule for kinds, rule in _FAILURES if isinstance(error, kinds))
+        rule = next((rule for kinds, rule in _FAILURES if isinstance(error, kinds)), "value")
         text, python = shortened(str(error) or type(error).__name__, 200), error_class(error)
         caught = None if python is None else Error(python, text)
         return SandboxError(line, rule, f"{self._excerpt(line)}: {text}", caught)
@@ -132,9 +141,8 @@ class Expressions:
             return modules.BUILT_IN[name]
         if name in ERRORS:
             return ErrorType(ERRORS[name])
-        known = [*scope.variables, *scope.program.variables, *self._functions, *vocabulary.BUILTINS]
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = vocabulary.HINTS.get(name) or (f"; did you mean {near[0]!r}?" if near else "")
+        near = similar(name, [*self._functions, *vocabulary.BUILTINS, *scope.program.variables, *scope.variables])
+        hint = vocabulary.HINTS.get(name) or (f"; did you mean {near!r}?" if near else "")
         raise Refusal("names", f"{name[:80]!r} is not known{hint}")
 
     def _attribute(self, node: ast.Attribute, scope: Scope) -> Any:
@@ -157,9 +165,8 @@ class Expressions:
 
     def _field(self, record: Record, name: object) -> Any:
         if not isinstance(name, str) or name.startswith("_"):
-            raise Refusal(
-                "attributes", f"an observation's fields are named; {shortened(repr(name), 80)} is none of them"
-            )
+            shown = repr(name[:60]) if isinstance(name, str) else f"a value of kind {kind_of(name)}"
+            raise Refusal("attributes", f"an observation's fields are named; {shown} is none of them")
         try:
             return self._guard.host(f"the observation's {name[:80]}", record.__getitem__, name)
         except Refusal as refusal:
@@ -385,17 +392,16 @@ class Expressions:
             method = vocabulary.METHODS.get(kind_of(value), {}).get(node.attr)
             if method is None:
                 raise Refusal("attributes", f"{kind_of(value)} has no method {node.attr!r} to call")
-            guard = self._guard
-            return lambda *arguments, **named: guard.take_all(method(guard, value, *arguments, **named))
+            return self._vocabulary(node.attr, method, value)
         return self._callable(self.eval(node, scope), node.id if isinstance(node, ast.Name) else "")
 
     def _callable(self, value: object, name: str = "") -> Callable[..., Any]:
         if isinstance(value, Function):
             return value.call
         if isinstance(value, DType):
-            return lambda *arguments: self._guard.take(converted(self._guard, value, *arguments))
+            return self._vocabulary(value.name, converted, value)
         if isinstance(value, ErrorType):
-            return lambda *arguments: self._error(value, arguments)
+            return self._of_errors(value)
         if isinstance(value, (Record, RecordList)):  # upstream's are functions that give the present state
             return lambda: value
         what = f"{name!r} is" if name else "this is"
@@ -404,13 +410,35 @@ class Expressions:
         hint = "; give the map itself to execute" if isinstance(value, Opaque) else ""
         raise Refusal("functions", f"{what} a value of kind {kind_of(value)}, not a function{hint}", TypeError)
 
-    def _error(self, kind: ErrorType, arguments: tuple[object, ...]) -> Error:
-        text = ", ".join(formatting.text(self._guard, argument) for argument in arguments)
-        return Error(kind.python, shortened(text))
+    def _of_errors(self, kind: ErrorType) -> Callable[..., Error]:
+        def make(*arguments: object, **named: object) -> Error:
+            if named:
+                raise Refusal("types", f"{kind.name}() takes no named arguments")
+            text = ", ".join(formatting.text(self._guard, argument) for argument in arguments)
+            return self._guard.take(Error(kind.python, shortened(text)))
+
+        return make
 
     def _of_vocabulary(self, name: str, function: Callable[..., Any]) -> Function:
+        return Function(name, self._vocabulary(name, function))
+
+    def _vocabulary(self, name: str, function: Callable[..., Any], *first: object) -> Callable[..., Any]:
+        """A function of the vocabulary as programs call it, with its first arguments given."""
         guard = self._guard
-        return Function(name, lambda *arguments, **named: guard.take_all(function(guard, *arguments, **named)))
+
+        def call(*arguments: object, **named: object) -> Any:
+            try:
+                made = function(guard, *first, *arguments, **named)
+            except TypeError as error:
+                told = about_arguments(name, str(error))
+                if not told:
+                    raise
+                if "keyword argument" not in told:  # the numbers in it count what programs do not see
+                    told = f"{name}() is given fewer or more arguments than it takes"
+                raise Refusal("types", told, TypeError) from None
+            return guard.take_all(made)
+
+        return call
 
     def _of_host(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: object, **named: object) -> Any:
@@ -431,6 +459,8 @@ class Expressions:
             return values.listed(self._guard, value)
         if "range" in weight.kinds:
             raise Refusal("types", f"{name}() takes numbers and lists of them; write list(range(...))")
+        if not isinstance(value, np.ndarray):
+            self._guard.room((weight.numbers,))
         return value
 
 

@@ -18,7 +18,7 @@ from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Stream, 
 
 # Numbers in one piece of text.
 _PRINTED = 1000
-_FORMAT = re.compile(r"([^{}]?[<>^=])?[-+ ]?#?0?\d{0,2}[,_]?(\.\d{1,2})?[bcdeEfFgGosxX%]?")
+_FORMAT = re.compile(r"([^{}]?[<>^=])?[-+ ]?#?0?\d{0,2}[,_]?(\.\d{1,2})?[bdeEfFgGosxX%]?")
 _PERCENT = re.compile(
     r"%(?:\((?P<key>[^()]*)\))?(?P<flags>[-+ 0#]*)(?P<width>\*|\d*)(?P<digits>\.\*|\.\d*)?(?P<type>.|$)", re.S
 )

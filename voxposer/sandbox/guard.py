@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -22,14 +23,18 @@ from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Module, 
 
 # Array elements that count as one interpreter step: working on them takes about as long as one node.
 ELEMENTS_A_STEP = 1000
-# Steps between two readings of the clock.
-_STEPS_A_LOOK = 500
+# Steps between two readings of the clock; whatever may take long reads it as well.
+_STEPS_A_LOOK = 100
+# Seconds that pass before the time of this thread is read again: that is a call of the system, and slow on some.
+_CLOCK_S = 0.005
 # Bytes counted for an item of a list (enough for a tuple of two numbers), and for a character.
-_ITEM_BYTES, _CHARACTER_BYTES = 100, 4
+ITEM_BYTES, _CHARACTER_BYTES = 100, 4
+# Elements that one call may put in order, and the steps that a thousand of them count for.
+_SORTED, _STEPS_OF_SORTING = 2**22, 10
 # Largest number of dimensions of an array: the cost of printing or rolling one grows exponentially with it.
 _DIMENSIONS = 8
-# Bytes counted for a function with its scope, and for a suspended generator.
-FUNCTION_BYTES, STREAM_BYTES = 1000, 4000
+# Bytes counted for a function with its scope, for a suspended generator, and for an error besides its text.
+FUNCTION_BYTES, STREAM_BYTES, _ERROR_BYTES = 2000, 4000, 500
 # Characters of a message that comes from elsewhere.
 _MESSAGE = 600
 
@@ -59,6 +64,10 @@ class Refusal(Exception):
         super().__init__(f"{reason} [{rule}]")
         self.rule, self.reason = rule, reason
         self.python = python if python is not None else _CATCHABLE.get(rule)
+
+
+class Kept(int):
+    """What a function of the host returns that keeps bytes for the program and otherwise returns None."""
 
 
 class HostFault(Exception):
@@ -96,8 +105,10 @@ class Limits:
             that one program calls.
         calls: calls of the host's functions and reads of its records; shared likewise.
         programs: further programs requested from the model; shared likewise.
-        seconds: time spent in programs, excluding the host's functions; shared likewise.
-        memory_bytes: all that one run of one program allocates, freed or not.
+        seconds: computing time of this thread in programs and in the host's functions, without what is spent on
+            asking the model; shared likewise.
+        memory_bytes: all that a program allocates, freed or not, what the host keeps for it included. The programs
+            that it calls share it; what they leave is given back when they end.
         array_elements: elements of one array.
         items: items of a list, tuple or dictionary, nested ones included.
         text_chars: characters of a string.
@@ -122,7 +133,12 @@ class Limits:
 
 
 class Budget:
-    """Steps, calls and time left to a program and to all programs that it calls."""
+    """Steps, calls, time and memory left to a program and to all programs that it calls.
+
+    Attributes:
+        depth: expressions, calls and generators that are entered.
+        memory: bytes left.
+    """
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
@@ -130,7 +146,9 @@ class Budget:
         self._programs = limits.programs
         self._unseen = 0
         self._since: float | None = None
+        self._looked = 0.0
         self.depth = 0
+        self.memory = limits.memory_bytes
 
     def deeper(self, levels: int = 1) -> None:
         """Enter an expression, a call or a generator; whoever entered subtracts the levels again."""
@@ -139,17 +157,17 @@ class Budget:
             raise Refusal("nesting", f"calls and generators more than {self.limits.depth} levels deep")
 
     def step(self, count: int = 1) -> None:
-        """Count steps, and check the time every few hundred."""
+        """Count steps, and check the time now and then."""
         self._steps -= count
         self._unseen += count
         if self._steps < 0:
             raise Refusal("steps", f"more than {self.limits.steps} steps: a loop that is too long or never ends")
         if self._unseen >= _STEPS_A_LOOK:
-            self._unseen = 0
-            self._look()
+            self.look()
 
     def call(self) -> None:
         """Count one call of the host."""
+        self.look()
         self._calls -= 1
         if self._calls < 0:
             raise Refusal("calls", f"more than {self.limits.calls} calls of given functions and reads of observations")
@@ -162,7 +180,7 @@ class Budget:
 
     @contextlib.contextmanager
     def clock(self, running: bool) -> Iterator[None]:
-        """Run the clock (in a program) or stop it (in the host); its previous state is restored afterwards."""
+        """Run the clock (in a program) or stop it (asking the model); its previous state is restored afterwards."""
         was_running = self._since is not None
         self._set(running)
         try:
@@ -170,13 +188,29 @@ class Budget:
         finally:
             self._set(was_running)
 
+    @contextlib.contextmanager
+    def nested(self) -> Iterator[None]:
+        """Run a program; the memory it took is given back afterwards."""
+        before = self.memory
+        try:
+            with self.clock(running=True):
+                yield
+        finally:
+            self.memory = before
+
     def _set(self, running: bool) -> None:
-        now = time.monotonic()
+        now = time.thread_time()
         if self._since is not None:
             self._seconds -= now - self._since
         self._since = now if running else None
 
-    def _look(self) -> None:
+    def look(self) -> None:
+        """Check the time, if some has passed since the last look."""
+        self._unseen = 0
+        now = time.monotonic()
+        if now - self._looked < _CLOCK_S:
+            return
+        self._looked = now
         self._set(self._since is not None)
         if self._seconds < 0:
             raise Refusal("time", f"more than {self.limits.seconds} s of computing")
@@ -187,16 +221,15 @@ class Guard:
 
     def __init__(self, budget: Budget) -> None:
         self.budget, self.limits = budget, budget.limits
-        self._memory = self.limits.memory_bytes
 
     def hold(self, size: int) -> None:
         """Count bytes that the program has made or is about to make."""
         self.require_memory(size)
-        self._memory -= size
+        self.budget.memory -= size
 
     def require_memory(self, size: int) -> None:
         """Refuse an allocation that would exceed the memory limit."""
-        if size > self._memory:
+        if size > self.budget.memory:
             raise Refusal("memory", f"values of more than {self.limits.memory_bytes} bytes in all")
 
     def room(self, shape: Sequence[int], itemsize: int = 8) -> None:
@@ -208,6 +241,12 @@ class Guard:
             raise Refusal("memory", f"an array of {elements} elements; {self.limits.array_elements} are allowed")
         self.require_memory(elements * itemsize)
         self.budget.step(elements // ELEMENTS_A_STEP)
+
+    def order(self, elements: int) -> None:
+        """Refuse to put in order, or to look up in order, more elements than that takes a moment for."""
+        if elements > _SORTED:
+            raise Refusal("memory", f"{elements} elements put in order; {_SORTED} are allowed")
+        self.budget.step(_STEPS_OF_SORTING * elements // ELEMENTS_A_STEP)
 
     def length(self, count: int) -> None:
         """Refuse a container with too many items, before it is made."""
@@ -226,6 +265,7 @@ class Guard:
 
     def take(self, value: object) -> Any:
         """A new value, checked, with its memory counted; a view counts as an array of its size."""
+        self.budget.look()
         if isinstance(value, np.ndarray):
             require_numbers(value)
             self.room(value.shape, value.itemsize)
@@ -235,12 +275,14 @@ class Guard:
             self.hold(len(value) * _CHARACTER_BYTES)
         elif isinstance(value, (list, tuple, dict, set)):
             self.length(len(value))
-            self.hold(len(value) * _ITEM_BYTES)
+            self.hold(len(value) * ITEM_BYTES)
             self.budget.step(len(value) // 100)
         elif type(value) is int:
             self.bits(value.bit_length())
         elif isinstance(value, (Function, Stream)):
             self.hold(FUNCTION_BYTES if isinstance(value, Function) else STREAM_BYTES)
+        elif isinstance(value, Error):
+            self.hold(_ERROR_BYTES + len(value.text) * _CHARACTER_BYTES)
         else:
             kind_of(value)
         return value
@@ -254,7 +296,7 @@ class Guard:
         return self.take(value)
 
     def host(self, name: str, function: Callable[..., Any], /, *arguments: object, **named: object) -> Any:
-        """Call a function of the host, its time not counted.
+        """Call a function of the host; its time counts, and the bytes that it says it has :class:`Kept`.
 
         Raises:
             Refusal: it raised something other than a ``HostFault`` (the refusal's cause), or returned a value that
@@ -262,12 +304,15 @@ class Guard:
         """
         self.budget.call()
         try:
-            with self.budget.clock(running=False):
-                value = function(*arguments, **named)
+            value = function(*arguments, **named)
         except (HostFault, Refusal):  # a nested program exceeded this budget
             raise
         except Exception as error:
             raise _host_refusal(name, error) from error
+        self.budget.look()
+        if type(value) is Kept:
+            self.hold(value)
+            return None
         given = any(value is argument for argument in (*arguments, *named.values()))
         return value if given else self.take_all(value)
 
@@ -304,7 +349,7 @@ class Weight:
     """The counts of ``Guard.weigh``.
 
     Attributes:
-        numbers: numbers and elements of arrays and ranges.
+        numbers: numbers and elements of arrays and ranges, each counted as often as it appears.
         characters: characters of all strings.
         kinds: kinds of value that appear, other than lists, tuples and dictionaries.
     """
@@ -316,11 +361,21 @@ class Weight:
 
 def _host_refusal(name: str, error: Exception) -> Refusal:
     """What a program is told when a given function raised: catchable, unless it is the limit of a nested program."""
-    text = shortened(f"{name}: {type(error).__name__}: {error}")
+    text = shortened(f"{name}: {type(error).__name__}: {about_arguments(name, str(error)) or error}")
     refusal = Refusal("call", text, error_class(error))
     if hasattr(error, "rule") or error_class(error) is None:
         refusal.python = None
     return refusal
+
+
+def about_arguments(name: str, text: str) -> str:
+    """What Python says about arguments that a function does not take, by the function's name in programs; "" for other
+    texts."""
+    found = _ARGUMENTS.match(text)
+    return f"{name}() {found[1]}" if found else ""
+
+
+_ARGUMENTS = re.compile(r"[\w.<>]+\(\) ((?:takes|got|missing) .*)", re.S)
 
 
 def shortened(text: str, most: int = _MESSAGE) -> str:

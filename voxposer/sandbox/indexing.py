@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from voxposer.sandbox.guard import ELEMENTS_A_STEP, Guard, RecordList, Refusal, refuse_kind
-from voxposer.sandbox.values import APPENDED_BYTES, hashable, integer, listed, number_of, numbers
+from voxposer.sandbox.values import APPENDED_BYTES, ENTRY_BYTES, hashable, integer, listed, number_of, numbers
 
 
 def subscript(guard: Guard, value: object, index: object) -> Any:
@@ -47,7 +47,7 @@ def assign(guard: Guard, value: object, index: object, item: object) -> None:
     elif isinstance(value, dict):
         value[hashable(guard, index)] = item
         guard.length(len(value))
-        guard.hold(APPENDED_BYTES)
+        guard.hold(ENTRY_BYTES)
     elif isinstance(value, list) and isinstance(index, slice):
         items = listed(guard, item)
         guard.length(len(value) + len(items))
@@ -143,7 +143,7 @@ def voxel_index(guard: Guard, value: np.ndarray, index: object) -> Any:
         places = numbers(guard, index)
         if places.dtype == bool:
             return places
-        if places.ndim > 1:
+        if places.ndim > 1 or places.size > value.ndim:
             raise Refusal("types", "a map takes x, y, z, slices or an array of truth values as its index")
         index = tuple(places[None].ravel().tolist())
     parts = index if isinstance(index, tuple) else (index,)

@@ -80,7 +80,7 @@ class Program:
         run = Statements(self.source, functions, Guard(budget), returns if at_once else None)
         scope = Scope(variables=dict(variables or {}))
         try:
-            with budget.clock(running=True), np.errstate(all="ignore"):
+            with budget.nested(), np.errstate(all="ignore"):
                 ended = run.run(self.body, scope)
             left = {name: value for name, value in scope.variables.items() if not isinstance(value, _OF_A_RUN)}
         finally:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import ast
 import difflib
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from voxposer.sandbox import vocabulary
@@ -120,12 +121,22 @@ def member(module: Module, name: str, given: Mapping[str, Function] | None = Non
             raise Refusal("names", "np.random is not there: programs give the same result each time")
     if dotted in _TABLES[root]:
         return _TABLES[root][dotted]
-    near = difflib.get_close_matches(dotted, _TABLES[root], n=1)
+    near = similar(dotted, _TABLES[root])
     short = "np" if root == "numpy" else root
-    hint = f"; did you mean {short}.{near[0]}?" if near else ""
+    hint = f"; did you mean {short}.{near}?" if near else ""
     raise Refusal("names", f"{short}.{dotted[:60]} is not among the functions of {root} that are allowed{hint}")
 
 
+def similar(name: str, known: Iterable[str]) -> str:
+    """The one of the known names that is most similar to a name, "" for none; long names and many are not compared."""
+    if len(name) > _COMPARED:
+        return ""
+    short = itertools.islice((each for each in known if len(each) <= _COMPARED), _NAMES)
+    return next(iter(difflib.get_close_matches(name, short, n=1)), "")
+
+
+# Characters of names, and names, that are compared to find a similar one.
+_COMPARED, _NAMES = 40, 300
 _TYPE_NAMES = ("ndarray", "integer", "floating", "number", "generic")
 
 

@@ -30,8 +30,8 @@ from voxposer.sandbox.values import (
 
 Function = Callable[..., Any]
 
-# Rows of a matrix to invert.
-_MATRIX = 100
+# Rows of a matrix to invert, and points that np.interp may look among.
+_MATRIX, _KNOTS = 100, 10_000
 
 
 def elementwise(name: str, arity: int) -> Function:
@@ -58,11 +58,13 @@ def reduction(name: str) -> Function:
     """A reduction of NumPy over all axes or one."""
     function = getattr(np, name)
 
-    def apply(guard: Guard, a: object, axis: object = None, keepdims: object = None) -> Any:
+    def apply(guard: Guard, a: object, axis: object = None, *, keepdims: object = None) -> Any:
         values = numbers(guard, a)
         broadcast(guard, values)
         if np.size(values) == 0 and name in _OF_SOME:
             raise Refusal("value", f"the {name} of no numbers")
+        if name == "median":
+            guard.order(np.size(values))
         extra = {} if keepdims is None else {"keepdims": bool(keepdims)}
         return function(values, axis=axis_of(axis), **extra)
 
@@ -176,8 +178,8 @@ def joining(name: str, with_axis: bool) -> Function:
     def apply(guard: Guard, arrays: object, **options: object) -> np.ndarray:
         if not set(options) <= ({"axis"} if with_axis else set()):
             raise Refusal("types", f"np.{name} takes arrays{' and axis' if with_axis else ''}")
+        guard.room((guard.weigh(arrays).numbers,))
         parts = [numbers(guard, part) for part in listed(guard, arrays)]
-        guard.room((sum(np.size(part) for part in parts),))
         return function(parts, **{key: axis_of(value) for key, value in options.items()})
 
     if not with_axis:
@@ -266,6 +268,19 @@ def rearranging(name: str, *parameters: str) -> Function:
     return apply
 
 
+def ordering(name: str) -> Function:
+    """``np.sort`` or ``np.argsort``."""
+    function = getattr(np, name)
+
+    def apply(guard: Guard, a: object, axis: object = -1) -> np.ndarray:
+        values = np.asarray(numbers(guard, a))
+        guard.room(values.shape)
+        guard.order(values.size)
+        return function(values, axis=None if axis is None else integer(axis))
+
+    return apply
+
+
 def reshape(guard: Guard, a: object, *shape: object) -> np.ndarray:
     """``np.reshape``."""
     lengths = shape_of(guard, shape[0] if len(shape) == 1 else shape)
@@ -278,7 +293,9 @@ def interp(guard: Guard, x: object, xp: object, fp: object) -> Any:
     """``np.interp``."""
     places, knots, values = (numbers(guard, value) for value in (x, xp, fp))
     broadcast(guard, places)
-    broadcast(guard, knots)
+    if np.size(knots) > _KNOTS:
+        raise Refusal("size", f"np.interp among {np.size(knots)} points; {_KNOTS} are allowed")
+    guard.order(np.size(places))
     return np.interp(places, knots, values)
 
 
@@ -323,13 +340,16 @@ def unique(guard: Guard, ar: object, axis: object = None) -> np.ndarray:
     """``np.unique``, the values alone."""
     values = np.asarray(numbers(guard, ar))
     guard.room(values.shape)
-    return np.unique(values, axis=None if axis is None else integer(axis))
+    guard.order(values.size)
+    # Counting takes NumPy's way of sorting: its hash table for integers takes ten times as long, and more memory.
+    return np.unique(values, return_counts=True, axis=None if axis is None else integer(axis))[0]
 
 
 def isin(guard: Guard, element: object, test_elements: object) -> np.ndarray:
     """``np.isin``."""
     values, among = np.asarray(numbers(guard, element)), np.asarray(numbers(guard, test_elements))
     guard.room((values.size + among.size,))
+    guard.order(values.size + among.size)
     return np.isin(values, among, kind="sort")
 
 
@@ -350,6 +370,7 @@ def percentile(guard: Guard, a: object, q: object, axis: object = None) -> Any:
     """``np.percentile``."""
     values, shares = np.asarray(numbers(guard, a)), np.asarray(numbers(guard, q))
     guard.room((values.size, shares.size))
+    guard.order(values.size)
     return np.percentile(values, shares, axis=axis_of(axis))
 
 

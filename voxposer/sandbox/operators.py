@@ -18,6 +18,7 @@ from voxposer.sandbox.guard import Guard, Refusal, kind_of, refuse_kind
 from voxposer.sandbox.objects import Stream
 from voxposer.sandbox.values import (
     APPENDED_BYTES,
+    ENTRY_BYTES,
     broadcast,
     hashable,
     listed,
@@ -27,6 +28,8 @@ from voxposer.sandbox.values import (
     truth,
 )
 
+# Characters compared that count as one step.
+COMPARED_A_STEP = 10_000
 # Multiplications of a matrix product that a program may ask for.
 _MULTIPLICATIONS = 10**8
 _SEQUENCES = (str, list, tuple)
@@ -61,7 +64,7 @@ _UNIONS: dict[type, tuple[str, ...]] = {set: ("|", "&", "-", "^"), dict: ("|",)}
 def _united(guard: Guard, symbol: str, left: Any, right: Any, in_place: bool) -> Any:
     """An operation of two sets, or the union of two dictionaries."""
     guard.length(len(left) + len(right))
-    guard.hold((len(left) + len(right)) * APPENDED_BYTES)
+    guard.hold((len(left) + len(right)) * ENTRY_BYTES)
     guard.budget.step((len(left) + len(right)) // 10)
     return (_IN_PLACE if in_place else _OPERATORS)[symbol](left, right)
 
@@ -168,10 +171,15 @@ def compare(guard: Guard, symbol: str, left: object, right: object) -> Any:
     return _COMPARISONS[symbol](left, right)
 
 
-def _equal(guard: Guard, left: object, right: object) -> Any:
+def equal(guard: Guard, left: object, right: object) -> Any:
     """``left == right``, where an array equals what has its shape and its numbers."""
     if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
-        return isinstance(left, np.ndarray) and isinstance(right, np.ndarray) and np.array_equal(left, right)
+        if not isinstance(left, np.ndarray) or not isinstance(right, np.ndarray) or left.shape != right.shape:
+            return False
+        guard.room(left.shape)
+        return np.array_equal(left, right)
+    if isinstance(left, str) and isinstance(right, str):
+        guard.budget.step(min(len(left), len(right)) // COMPARED_A_STEP)
     return left == right
 
 
@@ -184,9 +192,9 @@ def _contains(guard: Guard, container: object, item: object) -> bool:
     if isinstance(container, (dict, set)):
         return hashable(guard, item) in container
     if isinstance(container, (list, tuple)):
-        return any(item is each or truth(guard, _equal(guard, each, item)) for each in container)
+        return any(item is each or truth(guard, equal(guard, each, item)) for each in container)
     if isinstance(container, Stream):
-        return any(truth(guard, _equal(guard, each, item)) for each in container.items)
+        return any(truth(guard, equal(guard, each, item)) for each in container.items)
     if isinstance(container, np.ndarray):
         return truth(guard, (container == numbers(guard, item)).any())
     refuse_kind(container, "a list, a dictionary or text")

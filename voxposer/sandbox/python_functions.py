@@ -6,7 +6,7 @@ may use.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -17,9 +17,10 @@ from voxposer.sandbox.iteration import callable_of
 from voxposer.sandbox.numpy_functions import round_array
 from voxposer.sandbox.objects import DType, Error, ErrorType, TypeName
 from voxposer.sandbox.objects import Function as FunctionValue
-from voxposer.sandbox.operators import arithmetic
+from voxposer.sandbox.operators import COMPARED_A_STEP, arithmetic, equal
 from voxposer.sandbox.values import (
     APPENDED_BYTES,
+    ENTRY_BYTES,
     broadcast,
     count_of,
     digits_of,
@@ -210,7 +211,8 @@ def update_dict(guard: Guard, value: dict[Any, Any], given: object = (), /, **na
     """``dict.update``."""
     pairs = list(given.items()) if isinstance(given, dict) else [listed(guard, pair) for pair in listed(guard, given)]
     guard.length(len(value) + len(pairs) + len(named))
-    guard.hold((len(pairs) + len(named)) * APPENDED_BYTES)
+    guard.hold((len(pairs) + len(named)) * ENTRY_BYTES)
+    guard.budget.step((len(pairs) + len(named)) // 10)
     for pair in pairs:
         if len(pair) != 2:
             raise Refusal("value", f"{len(pair)} values where a key and a value belong")
@@ -231,6 +233,7 @@ def set_method(name: str) -> Function:
         given = [make_set(guard, other) for other in others]
         guard.length(len(value) + sum(len(other) for other in given))
         guard.budget.step((len(value) + sum(len(other) for other in given)) // 10)
+        guard.hold(sum(len(other) for other in given) * ENTRY_BYTES)
         return function(value, *given)
 
     return apply
@@ -242,7 +245,7 @@ def set_item_method(name: str) -> Function:
 
     def apply(guard: Guard, value: set[Any], item: object) -> None:
         guard.length(len(value) + 1)
-        guard.hold(APPENDED_BYTES)
+        guard.hold(ENTRY_BYTES)
         function(value, hashable(guard, item))
 
     return apply
@@ -289,7 +292,7 @@ def astype(guard: Guard, value: np.ndarray, dtype: object) -> Any:
 
 def tolist(guard: Guard, value: npt.ArrayLike) -> Any:
     """``array.tolist``."""
-    guard.length(np.size(value))
+    guard.length(np.prod(np.maximum(np.shape(value), 1), dtype=float))
     return np.asarray(value).tolist()
 
 
@@ -307,6 +310,7 @@ def fill_in_place(guard: Guard, value: np.ndarray, number: object) -> None:
 def sort_in_place(guard: Guard, value: np.ndarray, axis: SupportsIndex = -1) -> None:
     """``array.sort``."""
     guard.room(value.shape)
+    guard.order(value.size)
     value.sort(axis=axis)
 
 
@@ -352,19 +356,33 @@ def pop_key(guard: Guard, value: dict[Any, Any], key: object, default: object = 
 def set_default(guard: Guard, value: dict[Any, Any], key: object, default: object = None) -> Any:
     """``dict.setdefault``."""
     guard.length(len(value) + 1)
-    guard.hold(APPENDED_BYTES)
+    guard.hold(ENTRY_BYTES)
     return value.setdefault(hashable(guard, key), default)
 
 
-def sequence_method(name: str) -> Function:
-    """A method of lists and tuples that looks for an item."""
+def places_of(guard: Guard, value: Sequence[Any], item: object) -> Iterator[int]:
+    """The places at which an item is in a list or tuple."""
+    guard.weigh(value)
+    guard.weigh(item)
+    return (place for place, each in enumerate(value) if each is item or truth(guard, equal(guard, each, item)))
 
-    def apply(guard: Guard, value: object, item: object) -> Any:
-        guard.weigh(value)
-        guard.weigh(item)
-        return getattr(value, name)(item)
 
-    return apply
+def index_of(guard: Guard, value: Sequence[Any], item: object) -> int:
+    """``list.index`` and ``tuple.index``."""
+    place = next(places_of(guard, value, item), None)
+    if place is None:
+        raise Refusal("value", "the item is not in it", ValueError)
+    return place
+
+
+def count_in(guard: Guard, value: Sequence[Any], item: object) -> int:
+    """``list.count`` and ``tuple.count``."""
+    return sum(1 for _ in places_of(guard, value, item))
+
+
+def remove_item(guard: Guard, value: list[Any], item: object) -> None:
+    """``list.remove``."""
+    del value[index_of(guard, value, item)]
 
 
 def sort_list(guard: Guard, value: list[Any], *, key: object = None, reverse: object = False) -> None:
@@ -382,7 +400,7 @@ def replace_text(guard: Guard, value: str, old: str, new: str, count: object = -
 def join_text(guard: Guard, value: str, parts: object) -> str:
     """``str.join``."""
     pieces = [require_text(part) for part in listed(guard, parts)]
-    guard.characters(sum(len(piece) + len(value) for piece in pieces))
+    guard.characters(sum(len(piece) + len(value) for piece in pieces) - (len(value) if pieces else 0))
     return value.join(pieces)
 
 
@@ -400,15 +418,14 @@ def text_method(name: str, least: int, most: int) -> Function:
             raise Refusal("types", f".{name}() got {len(arguments)} arguments")
         given = [_texts(argument) if name in _SEVERAL else require_text(argument) for argument in arguments]
         length = sum(len(item) for item in given)
-        guard.budget.step(len(value) * max(length, 1) // _COMPARED_A_STEP)
+        guard.budget.step(len(value) * max(length, 1) // COMPARED_A_STEP)
         return function(value, *given)
 
     return apply
 
 
-# Methods that take a tuple of texts as well, and characters compared that count as one step.
+# Methods that take a tuple of texts as well.
 _SEVERAL = ("startswith", "endswith")
-_COMPARED_A_STEP = 10_000
 
 
 def _texts(value: object) -> str | tuple[str, ...]:

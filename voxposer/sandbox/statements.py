@@ -18,11 +18,12 @@ from typing import Any
 
 from voxposer.sandbox import formatting, indexing, modules, values
 from voxposer.sandbox.expressions import Expressions
-from voxposer.sandbox.guard import Guard, Refusal, kind_of
+from voxposer.sandbox.guard import ITEM_BYTES, Guard, Refusal, kind_of
 from voxposer.sandbox.iteration import stream
 from voxposer.sandbox.objects import ERRORS, Error, ErrorType, Function
 from voxposer.sandbox.scopes import Names, Scope, depth_of, is_generator, names_of
 from voxposer.sandbox.syntax import SYMBOLS, SandboxError
+from voxposer.sandbox.values import APPENDED_BYTES, ENTRY_BYTES
 
 
 class Jump(enum.Enum):
@@ -62,6 +63,7 @@ class Statements(Expressions):
     ) -> None:
         super().__init__(source, functions, guard)
         self._returns = returns
+        self._definitions: dict[int, tuple[Names, int, bool]] = {}
         self._simple: dict[type[ast.AST], Callable[[Any, Scope], End]] = {
             ast.Assign: self._assign,
             ast.AnnAssign: self._annotated,
@@ -91,7 +93,7 @@ class Statements(Expressions):
     def close(self) -> None:
         """Let go of the tables; functions of this run can no longer be called."""
         super().close()
-        self._simple, self._compound = {}, {}
+        self._simple, self._compound, self._definitions = {}, {}, {}
 
     def run(self, body: Sequence[ast.stmt], scope: Scope) -> End:
         """Run the statements of a block to its end."""
@@ -209,7 +211,10 @@ class Statements(Expressions):
         if last is not None:
             return last
         if failure is not None:
-            raise failure
+            try:
+                raise failure
+            finally:
+                failure = None  # an error that its own frame holds would keep the maps of the program
         return ended
 
     def _attempt(self, block: Block) -> Generator[Any, None, tuple[End, SandboxError | None]]:
@@ -226,7 +231,11 @@ class Statements(Expressions):
         assert error is not None
         handler = next((each for each in node.handlers if self._catches(each, error, scope)), None)
         if handler is None:
-            raise failure
+            try:
+                raise failure
+            finally:
+                del failure
+        self._guard.take(error)
         scope.handling.append(error)
         if handler.name:
             self.bind(handler.name, error, scope)
@@ -295,9 +304,10 @@ class Statements(Expressions):
         named = [None if default is None else (self.eval(default, scope),) for default in arguments.kw_defaults]
         for default in (*defaults, *(given[0] for given in named if given)):
             kind_of(default)
+        self._guard.hold((len(defaults) + len(named)) * APPENDED_BYTES)
         signature = _Signature(name, arguments, defaults, named)
         self._captured.append(scope)
-        names, levels, yields = names_of(arguments, body), _CALL_LEVELS + 2 * depth_of(body), is_generator(body)
+        names, levels, yields = self._known(arguments, body)
 
         def call(*given: object, **options: object) -> Any:
             inner = self._inner(names, signature.bound(given, options), scope)
@@ -314,19 +324,30 @@ class Statements(Expressions):
 
         return self._guard.take(Function(name, call))
 
+    def _known(self, arguments: ast.arguments, body: Sequence[ast.stmt]) -> tuple[Names, int, bool]:
+        """The names that a function binds, the levels of a call, and whether it yields: once for each definition."""
+        found = self._definitions.get(id(arguments))
+        if found is None:
+            found = names_of(arguments, body), _CALL_LEVELS + 2 * depth_of(body), is_generator(body)
+            self._definitions[id(arguments)] = found
+        return found
+
     def _inner(self, names: Names, bound: dict[str, Any], scope: Scope) -> Scope:
         """The scope of one call."""
         if not self._simple:
             raise Refusal("functions", "a function of a program that has ended")
-        self._guard.hold(sum(_SCOPE_BYTES for _ in bound) + _SCOPE_BYTES)
+        self._guard.hold(_SCOPE_BYTES + len(bound) * ITEM_BYTES)
+        for value in bound.values():
+            if isinstance(value, (tuple, dict)):  # of * and **, or given
+                self._guard.hold(len(value) * (ENTRY_BYTES if isinstance(value, dict) else APPENDED_BYTES))
         return Scope(scope, names.local, names.from_program, names.from_outside, variables=bound)
 
     def _generated(self, body: Sequence[ast.stmt], scope: Scope) -> Iterator[Any]:
         yield from self.block(body, scope)
 
 
-# Bytes counted for a variable of a call.
-_SCOPE_BYTES = 100
+# Bytes counted for a call, besides its variables.
+_SCOPE_BYTES = 700
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import ast
 import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from voxposer.sandbox.guard import Limits, Refusal
+from voxposer.sandbox.guard import Limits, Refusal, shortened
 from voxposer.sandbox.objects import Error
 
 RULES: Mapping[str, str] = MappingProxyType(
@@ -46,6 +47,10 @@ RULES: Mapping[str, str] = MappingProxyType(
 )
 
 
+# Characters of a reason, the excerpt of the source in it included.
+_REASON = 900
+
+
 class SandboxError(ValueError):
     """A program that cannot be run, or not on.
 
@@ -57,6 +62,7 @@ class SandboxError(ValueError):
     """
 
     def __init__(self, line: int, rule: str, reason: str, error: Error | None = None) -> None:
+        reason = shortened(reason, _REASON)
         super().__init__(f"line {line}: {reason} [rule: {rule}]")
         self.line, self.rule, self.reason, self.error = line, rule, reason, error
 
@@ -126,6 +132,7 @@ def checked_tree(source: str, limits: Limits) -> ast.Module:
     """
     if len(source) > limits.source_chars:
         raise SandboxError(1, "size", f"{len(source)} characters of source; {limits.source_chars} are allowed")
+    _require_text(source)
     tree = _tree(source)
     yields = {id(node.value) for node in ast.walk(tree) if isinstance(node, (ast.Expr, ast.Assign, ast.AnnAssign))}
     for node, line, depth in _walk(tree):
@@ -151,14 +158,24 @@ def reads(body: Iterable[ast.stmt], name: str) -> bool:
     )
 
 
+def _require_text(source: str) -> None:
+    """Refuse characters that no file has, of which versions of Python think differently."""
+    for place, character in enumerate(source):
+        if character == "\0" or "\ud800" <= character <= "\udfff":
+            line = len(re.findall(r"\r\n|\r|\n", source[:place])) + 1
+            raise SandboxError(line, "syntax", f"not Python: U+{ord(character):04X} is not a character of text")
+
+
 def _tree(source: str) -> ast.Module:
     try:
-        return ast.parse(source)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of escapes that Python does not know, such as \d
+            return ast.parse(source)
     except SyntaxError as error:
         raise SandboxError(error.lineno or 1, "syntax", f"not Python: {error.msg}") from None
     except (RecursionError, MemoryError):  # Python's parser gives up on deep nesting with either
         raise SandboxError(1, "nesting", "syntax nested too deep to parse") from None
-    except ValueError as error:  # NUL bytes and lone surrogates, by version of Python
+    except ValueError as error:
         raise SandboxError(1, "syntax", f"not Python: {error}") from None
 
 
@@ -273,6 +290,13 @@ def _check_function(node: ast.FunctionDef) -> None:
         raise Refusal("definitions", "a decorator; call the function on the value instead")
 
 
+def _check_arguments(node: ast.arguments) -> None:
+    starred = [argument for argument in (node.vararg, node.kwarg) if argument is not None]
+    names = [argument.arg for argument in (*node.posonlyargs, *node.args, *node.kwonlyargs, *starred)]
+    if len(set(names)) < len(names):
+        raise Refusal("syntax", "two parameters of one name")
+
+
 def _check_lambda(node: ast.Lambda) -> None:
     if any(isinstance(inner, (ast.Yield, ast.YieldFrom)) for inner in ast.walk(node.body)):
         raise Refusal("syntax", "a yield in a lambda; write def")
@@ -290,6 +314,7 @@ _CHECKS: dict[type[ast.AST], Callable[[Any], None]] = {
     ast.Attribute: lambda node: _require_public(node.attr),
     ast.keyword: lambda node: _require_public(node.arg or ""),
     ast.arg: lambda node: _require_plain(node.arg),
+    ast.arguments: _check_arguments,
     ast.alias: lambda node: _require_plain(node.asname),
     ast.ExceptHandler: lambda node: _require_plain(node.name),
     ast.Constant: _check_constant,

@@ -31,8 +31,8 @@ from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Stream, 
 _DIGITS = 20
 # Axes that one call may name.
 _AXES = 8
-# Bytes counted for an item put into a list.
-APPENDED_BYTES = 16
+# Bytes counted for an item put into a list, and into a dictionary or a set.
+APPENDED_BYTES, ENTRY_BYTES = 16, 100
 
 DTYPES: Mapping[str, DType] = MappingProxyType(
     {
@@ -74,7 +74,11 @@ def array(guard: Guard, value: object, dtype: DType | None = None) -> np.ndarray
     if not weight.kinds <= {"number", "array", "range"}:
         raise Refusal("types", f"an array of {' and '.join(sorted(weight.kinds))}; only numbers are allowed")
     guard.room((weight.numbers,))
-    made = np.array(value)
+    if not isinstance(value, np.ndarray):
+        if "range" in weight.kinds and not isinstance(value, range):  # whose numbers NumPy takes one by one
+            guard.length(weight.numbers)
+        guard.hold(8 * weight.numbers)  # several lists may become arrays before they are put together
+    made = np.arange(value.start, value.stop, value.step) if isinstance(value, range) else np.array(value)
     require_numbers(made)
     return made if dtype is None else made.astype(dtype_of(dtype))
 
@@ -163,6 +167,7 @@ def truth(guard: Guard, value: object) -> bool:
 def hashable(guard: Guard, key: object) -> Any:
     """A key or an item of a set: text, a number, None, or a tuple of them."""
     weight = guard.weigh(key)
+    guard.characters(weight.characters)
     if isinstance(key, tuple):
         if not weight.kinds <= {"text", "number", "None"} or _holds_unhashable(key):
             raise Refusal("types", "a tuple as a key holds text, numbers and None only")

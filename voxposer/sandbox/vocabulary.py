@@ -37,7 +37,8 @@ NUMPY: Mapping[str, Function] = MappingProxyType(
     | {name: npf.elementwise(name, 2) for name in _BINARY.split()}
     | {name: npf.reduction(name) for name in _REDUCTIONS.split()}
     | {name: npf.rearranging(name, "axis", "keepdims") for name in ("argmin", "argmax", "count_nonzero")}
-    | {name: npf.rearranging(name, "axis") for name in ("cumsum", "cumprod", "sort", "argsort", "flip")}
+    | {name: npf.rearranging(name, "axis") for name in ("cumsum", "cumprod", "flip")}
+    | {name: npf.ordering(name) for name in ("sort", "argsort")}
     | {name: npf.rearranging(name, "axis") for name in ("squeeze", "expand_dims")}
     | {name: npf.rearranging(name) for name in ("atleast_1d", "flipud", "fliplr", "flatnonzero")}
     | {name: npf.joining(name, with_axis=False) for name in ("column_stack", "dstack")}
@@ -185,15 +186,15 @@ METHODS: Mapping[str, Mapping[str, Function]] = MappingProxyType(
             "extend": pyf.extend_list,
             "insert": pyf.insert_item,
             "pop": pyf.pop_item,
-            "remove": pyf.sequence_method("remove"),
-            "index": pyf.sequence_method("index"),
-            "count": pyf.sequence_method("count"),
+            "remove": pyf.remove_item,
+            "index": pyf.index_of,
+            "count": pyf.count_in,
             "reverse": lambda guard, value: value.reverse(),
             "sort": pyf.sort_list,
             "copy": lambda guard, value: listed(guard, value),
             "clear": pyf.clear,
         },
-        "tuple": {"index": pyf.sequence_method("index"), "count": pyf.sequence_method("count")},
+        "tuple": {"index": pyf.index_of, "count": pyf.count_in},
         "dictionary": {
             "keys": pyf.dict_method("keys"),
             "values": pyf.dict_method("values"),
