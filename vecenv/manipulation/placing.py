@@ -9,11 +9,13 @@ a transfer.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vecenv.manipulation.grasps import Grasps, Gripper, clearance, find_grasps, room_around
+from vecenv.manipulation.reach import PandaArm
+from vecenv.manipulation.rims import find_rim_grasps
 from vecenv.manipulation.world import Margins, SceneGeometry, around, down_facing, leaning, spun, upright, yaw
 
 
@@ -65,7 +67,7 @@ def choose_grasp(
     """The best grasp of an object among its neighbours, or None when it offers nothing to hold.
 
     The open hand is tried first, pointing down; where neighbours leave it no room, the hand with half-closed fingers
-    and the hand that leans to some side.
+    and the hand that leans to some side. A dish without faces to hold is taken by its rim.
 
     Args:
         world: the scene.
@@ -76,6 +78,9 @@ def choose_grasp(
     wide = _best_grasp(world, name, failed, world.config.gripper)
     if wide is not None and wide[1] > world.config.least_room:
         return wide[0]
+    rim = wide is None and _rim_grasp(world, name, failed)
+    if rim:
+        return rim
     half_closed = narrow and _best_grasp(world, name, failed, world.config.gripper.narrowed(world.config.narrow))
     for tilt in world.config.grasp_tilts if wide is None or wide[1] < 0 else ():
         leant = _tilted_grasp(world, name, failed, tilt)
@@ -136,6 +141,43 @@ def _tilted_grasp(world: SceneGeometry, name: str, failed: Sequence[np.ndarray],
         if i >= 0 and score[i] > highest:
             best, highest = Grasped(pos[i], rotations[i], float(grasps.width[i])), float(score[i])
     return best
+
+
+def _rim_grasp(world: SceneGeometry, name: str, failed: Sequence[np.ndarray]) -> Grasped | None:
+    """The best grasp of a dish by its rim that has room and that the arm can take; None if there is none."""
+    config, points = world.config, world.points(name)
+    grasps = find_rim_grasps(points, config.gripper)
+    if not len(grasps):
+        return None
+    middle, gripper = points.mean(axis=0), replace(config.gripper, taper=config.finger_taper)
+    near = around(middle[:2], np.concatenate([world.others(name), world.walls]), config.neighbours)
+    near = near[near[:, 2] > points[:, 2].min() + config.least_room]
+    rooms = np.array([_room_ahead(*hand, near, config.gripper) for hand in zip(grasps.pos, grasps.rotation, strict=True)])
+    table = _table_under(world, middle)
+    over = np.array([_room_ahead(*hand, table, gripper) for hand in zip(grasps.pos, grasps.rotation, strict=True)])
+    score = grasps.far / config.rim_scale + np.minimum(rooms, config.ample_room) / config.room_scale
+    score = score - np.abs(yaw(grasps.rotation)) / config.turn_scale - _reach_cost(world, grasps.pos)
+    score = score - grasps.tilt / config.tilt_scale
+    for place in failed:
+        tried = np.linalg.norm(grasps.pos - world.snapshot.poses[name][:3] - place, axis=1) < config.retry_radius
+        score = score - 5.0 * tried
+    fits = (rooms > config.least_room) & (over > config.least_over)
+    for i in np.flatnonzero(fits)[np.argsort(-score[fits], kind="stable")]:
+        if _reaches(world, grasps.pos[i], grasps.rotation[i]):
+            return Grasped(grasps.pos[i], grasps.rotation[i], config.gripper.half_opening)
+    return None
+
+
+def _room_ahead(pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gripper: Gripper) -> float:
+    """Room around an open hand at a pose and on its way there along its own axis, metres."""
+    local = (obstacles - pos) @ rotation @ down_facing(np.array([[0.0, 1.0, 0.0]]))[0].T
+    here = Grasps(np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), np.zeros(1), np.zeros(1))
+    return float(clearance(here, local, gripper)[0])
+
+
+def _reaches(world: SceneGeometry, pos: np.ndarray, rotation: np.ndarray) -> bool:
+    base = world.snapshot.panda_base
+    return base is None or bool(PandaArm(base).reaches(pos[None], rotation[None])[0])
 
 
 def _table_under(world: SceneGeometry, middle: np.ndarray) -> np.ndarray:
