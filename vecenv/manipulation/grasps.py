@@ -23,8 +23,6 @@ class Gripper:
     Attributes:
         half_opening: from the centre to the inside of an open pad.
         half_reach: from the centre to the outside of an open finger.
-        taper: how much thinner the fingers are at their tips, and from how far above these they are not. None thinner
-            by default: a box is on the safe side.
         finger_half_width: half of a finger's width across the closing direction.
         tip: how far the fingertips reach below the grip site.
         pad: lower and upper edge of the pads, relative to the grip site.
@@ -36,7 +34,6 @@ class Gripper:
 
     half_opening: float = 0.0385
     half_reach: float = 0.0655
-    taper: tuple[float, float] = (0.0, 0.035)
     finger_half_width: float = 0.0105
     tip: float = 0.0095
     pad: tuple[float, float] = (-0.0044, 0.0116)
@@ -244,9 +241,8 @@ def clearance(grasps: Grasps, obstacles: np.ndarray, gripper: Gripper = Gripper(
         return np.full(len(grasps), np.inf)
     u, v, h = _in_grasp_frames(grasps, obstacles)
     along, across = np.abs(u), np.abs(v)
-    thinner, length = gripper.taper
-    outside = gripper.half_reach - thinner * np.clip(1 - (h + gripper.tip) / length, 0.0, 1.0)
-    finger = np.maximum(np.maximum(gripper.half_opening - along, along - outside), across - gripper.finger_half_width)
+    middle, half = (gripper.half_reach + gripper.half_opening) / 2, (gripper.half_reach - gripper.half_opening) / 2
+    finger = np.maximum(np.abs(along - middle) - half, across - gripper.finger_half_width)
     finger = np.maximum(finger, -gripper.tip - h)
     palm = np.maximum(along - gripper.palm_half[0], across - gripper.palm_half[1])
     palm = np.maximum(palm, gripper.palm - h)

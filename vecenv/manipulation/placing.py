@@ -9,7 +9,7 @@ a transfer.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -149,19 +149,17 @@ def _rim_grasp(world: SceneGeometry, name: str, failed: Sequence[np.ndarray]) ->
     grasps = find_rim_grasps(points, config.gripper)
     if not len(grasps):
         return None
-    middle, gripper = points.mean(axis=0), replace(config.gripper, taper=config.finger_taper)
-    near = around(middle[:2], np.concatenate([world.others(name), world.walls]), config.neighbours)
+    near = around(points.mean(axis=0)[:2], np.concatenate([world.others(name), world.walls]), config.neighbours)
     near = near[near[:, 2] > points[:, 2].min() + config.least_room]
-    rooms = np.array([_room_ahead(*hand, near, config.gripper) for hand in zip(grasps.pos, grasps.rotation, strict=True)])
-    table = _table_under(world, middle)
-    over = np.array([_room_ahead(*hand, table, gripper) for hand in zip(grasps.pos, grasps.rotation, strict=True)])
+    hands = zip(grasps.pos, grasps.rotation, strict=True)
+    rooms = np.array([_room_ahead(*hand, near, config.gripper) for hand in hands])
     score = grasps.far / config.rim_scale + np.minimum(rooms, config.ample_room) / config.room_scale
     score = score - np.abs(yaw(grasps.rotation)) / config.turn_scale - _reach_cost(world, grasps.pos)
     score = score - grasps.tilt / config.tilt_scale
     for place in failed:
         tried = np.linalg.norm(grasps.pos - world.snapshot.poses[name][:3] - place, axis=1) < config.retry_radius
         score = score - 5.0 * tried
-    fits = (rooms > config.least_room) & (over > config.least_over)
+    fits = rooms > config.least_room
     for i in np.flatnonzero(fits)[np.argsort(-score[fits], kind="stable")]:
         if _reaches(world, grasps.pos[i], grasps.rotation[i]):
             return Grasped(grasps.pos[i], grasps.rotation[i], config.gripper.half_opening)

@@ -16,6 +16,9 @@ import numpy as np
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.world import HOME_ROTATION
 
+# A rim at least this far above the lower edge of the pads is held, metres.
+_EDGE = 0.003
+
 
 @dataclass(frozen=True, kw_only=True)
 class RimConfig:
@@ -25,7 +28,8 @@ class RimConfig:
         headings: number of directions around the object that are tried.
         tilts: of the hand from the vertical, outwards, best first, radians.
         outside: from the inside of the open outer pad to the rim.
-        above: from the middle of the pads down to the rim, along the hand.
+        fingertip: thickness of a finger at its tip, along the closing direction.
+        floor: fingertips stay this far above the object's underside: the deeper, the better pads hold.
         edge: points this close to the outermost one in a direction belong to the rim.
         wide: half width of the strip behind a rim in which the slope of the dish is looked for.
         behind: least and largest distance of that slope from the rim.
@@ -35,7 +39,8 @@ class RimConfig:
     headings: int = 48
     tilts: tuple[float, ...] = (0.1, 0.2)
     outside: float = 0.0085
-    above: float = -0.003
+    fingertip: float = 0.0145
+    floor: float = 0.0005
     edge: float = 0.006
     wide: float = 0.02
     behind: tuple[float, float] = (0.015, 0.045)
@@ -78,11 +83,13 @@ def find_rim_grasps(
     """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     found = [
-        (*_hand(rim, inward, tilt, gripper, config), far, tilt)
+        (pos, rotation, far, tilt)
         for heading in np.arange(config.headings) * 2 * np.pi / config.headings
         for inward in [np.array([np.cos(heading), np.sin(heading), 0.0])]
         for rim, far in _rim(points, middle, inward, config)
         for tilt in config.tilts
+        for pos, rotation in [_hand(rim, inward, tilt, float(points[:, 2].min()), gripper, config)]
+        if _holds(pos, rotation, rim, gripper)
     ]
     if not found:
         return RimGrasps(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0))
@@ -105,14 +112,20 @@ def _rim(
 
 
 def _hand(
-    rim: np.ndarray, inward: np.ndarray, tilt: float, gripper: Gripper, config: RimConfig
+    rim: np.ndarray, inward: np.ndarray, tilt: float, floor: float, gripper: Gripper, config: RimConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position [3] of the grip site and rotation [3, 3] of a hand at a rim that leans outwards, of two the one nearer home."""
+    """Position [3] and rotation [3, 3] of a hand that leans outwards at a rim; of two such, the one turned less."""
     up = np.array([0.0, 0.0, 1.0])
     ahead = np.sin(tilt) * inward - np.cos(tilt) * up
     closing = np.cos(tilt) * inward + np.sin(tilt) * up
     hands = [np.stack([np.cross(y, ahead), y, ahead], axis=1) for y in (closing, -closing)]
     rotation = max(hands, key=lambda hand: float(np.trace(hand @ HOME_ROTATION.T)))
-    along = gripper.half_opening - config.outside
-    lower = config.above + sum(gripper.pad) / 2
-    return rim + along * closing + lower * ahead, rotation
+    pos = rim + (gripper.half_opening - config.outside) * closing
+    tip = pos + gripper.tip * ahead - (gripper.half_opening + config.fingertip) * closing
+    return pos + (tip[2] - floor - config.floor) / np.cos(tilt) * ahead, rotation
+
+
+def _holds(pos: np.ndarray, rotation: np.ndarray, rim: np.ndarray, gripper: Gripper) -> bool:
+    """Whether a rim [3] is between the edges of the pads of a hand."""
+    depth = -float((rim - pos) @ rotation[:, 2])
+    return gripper.pad[0] + _EDGE < depth < gripper.pad[1]

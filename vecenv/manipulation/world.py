@@ -45,9 +45,6 @@ class Margins:
         widest_turn: hands turn no further than this from home, radians.
         overhang_scale: sticking out this much of a box to fit in costs one point.
         grasp_tilts: of a hand from the vertical, tried where no upright one has room to grasp, radians.
-        finger_taper: how much thinner the fingers are at their tips, and from how far above these they are not, [2];
-            counts only where the fingertips must go down to a table beside something thin.
-        least_over: at such a place fingertips stay this far over the table.
         rim_scale: at a rim, standing out this much further is worth one point.
         tilt_scale: at a rim, leaning this much more costs one point, radians.
         entry_tilts: of a hand that enters a space from a side, from the vertical, radians.
@@ -77,8 +74,6 @@ class Margins:
     widest_turn: float = 1.75
     overhang_scale: float = 0.005
     grasp_tilts: tuple[float, ...] = ()
-    finger_taper: tuple[float, float] = (0.012, 0.035)
-    least_over: float = 0.0015
     rim_scale: float = 0.001
     tilt_scale: float = 0.2
     entry_tilts: tuple[float, ...] = (1.4, 1.1, 0.8)
