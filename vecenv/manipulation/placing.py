@@ -110,7 +110,7 @@ def _best_grasp(
     origin = world.snapshot.poses[name][:3]
     for pos in failed:
         score = score - 5.0 * (np.linalg.norm(grasps.pos - origin - pos, axis=1) < config.retry_radius)
-    best = int(score.argmax())
+    best = _first_reached(world, score, grasps.pos, rotations)
     narrow = gripper.half_opening < config.gripper.half_opening
     return Grasped(grasps.pos[best], rotations[best], float(grasps.width[best]), narrow), float(room[best])
 
@@ -137,7 +137,7 @@ def _tilted_grasp(world: SceneGeometry, name: str, failed: Sequence[np.ndarray],
             tried = np.linalg.norm(pos - world.snapshot.poses[name][:3] - place, axis=1) < config.retry_radius
             score = score - 5.0 * tried
         score = np.where(room > config.least_room, score, -np.inf)
-        i = int(score.argmax()) if len(score) else -1
+        i = _first_reached(world, score, pos, rotations) if len(score) else -1
         if i >= 0 and score[i] > highest:
             best, highest = Grasped(pos[i], rotations[i], float(grasps.width[i])), float(score[i])
     return best
@@ -160,10 +160,10 @@ def _rim_grasp(world: SceneGeometry, name: str, failed: Sequence[np.ndarray]) ->
         tried = np.linalg.norm(grasps.pos - world.snapshot.poses[name][:3] - place, axis=1) < config.retry_radius
         score = score - 5.0 * tried
     fits = rooms > config.least_room
-    for i in np.flatnonzero(fits)[np.argsort(-score[fits], kind="stable")]:
-        if _reaches(world, grasps.pos[i], grasps.rotation[i]):
-            return Grasped(grasps.pos[i], grasps.rotation[i], config.gripper.half_opening)
-    return None
+    if not fits.any():
+        return None
+    i = _first_reached(world, np.where(fits, score, -np.inf), grasps.pos, grasps.rotation)
+    return Grasped(grasps.pos[i], grasps.rotation[i], config.gripper.half_opening)
 
 
 def _room_ahead(pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gripper: Gripper) -> float:
@@ -173,9 +173,18 @@ def _room_ahead(pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gr
     return float(clearance(here, local, gripper)[0])
 
 
-def _reaches(world: SceneGeometry, pos: np.ndarray, rotation: np.ndarray) -> bool:
-    base = world.snapshot.panda_base
-    return base is None or bool(PandaArm(base).reaches(pos[None], rotation[None])[0])
+def _first_reached(world: SceneGeometry, score: np.ndarray, pos: np.ndarray, rotations: np.ndarray) -> int:
+    """Row of the best hand that the arm can take; of the best one if it can take none, or if the arm is not known."""
+    best = int(score.argmax())
+    if world.snapshot.panda_base is None:
+        return best
+    arm = PandaArm(world.snapshot.panda_base)
+    for i in np.argsort(-score, kind="stable"):
+        if np.isneginf(score[i]):
+            break
+        if arm.reaches(pos[i][None], rotations[i][None])[0]:
+            return int(i)
+    return best
 
 
 def _table_under(world: SceneGeometry, middle: np.ndarray) -> np.ndarray:
