@@ -173,6 +173,12 @@ def _room_ahead(pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gr
     return float(clearance(here, local, gripper)[0])
 
 
+def _reaches(world: SceneGeometry, pos: np.ndarray, rotation: np.ndarray) -> bool:
+    """Whether the arm can take a pose; True for an arm that is not known."""
+    base = world.snapshot.panda_base
+    return base is None or bool(PandaArm(base).reaches(pos[None], rotation[None])[0])
+
+
 def _first_reached(world: SceneGeometry, score: np.ndarray, pos: np.ndarray, rotations: np.ndarray) -> int:
     """Row of the best hand that the arm can take; of the best one if it can take none, or if the arm is not known."""
     best = int(score.argmax())
@@ -217,10 +223,32 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
         for xy, cost in zip(target.xy, target.cost + abs(angle) / world.config.turn_scale, strict=True):
             if cost >= lowest:  # costs ascend and nothing makes them less
                 break
-            end, extra = _put_down_at(world, name, target, xy, angle)
+            end, extra = _put_down_at(world, name, target, xy, spun(np.eye(3), angle))
             if cost + extra < lowest:
                 best, lowest = (end, spun(rotation, angle)), cost + extra
-    return best
+    return best if _reaches(world, *best) else _put_down_leaning(world, name, target, best)
+
+
+def _put_down_leaning(
+    world: SceneGeometry, name: str, target: Target, upright_hand: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`put_down` where the arm cannot take the pose: the hand leans away from the robot, and the object with it.
+
+    Let go, the object tips back on its base.
+    """
+    pos, rotation = upright_hand
+    if world.base is None:
+        return upright_hand
+    out = np.append(pos[:2] - world.base, 0.0) / max(float(np.linalg.norm(pos[:2] - world.base)), 1e-9)
+    heading = float(np.arctan2(out[1], out[0]))
+    turn, places = rotation @ world.hand_rotation.T, (target.xy, target.cost)
+    for tilt in world.config.place_tilts:
+        lean = spun(leaning(tilt), heading) @ spun(np.eye(3), -heading)
+        options = [(*_put_down_at(world, name, target, xy, lean @ turn), cost) for xy, cost in zip(*places, strict=True)]
+        for end, _, _ in sorted(options, key=lambda option: option[1] + option[2]):
+            if _reaches(world, end, lean @ rotation):
+                return end, lean @ rotation
+    return upright_hand
 
 
 def put_in(world: SceneGeometry, name: str, target: Target, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -289,11 +317,10 @@ def _turns(world: SceneGeometry, name: str, target: Target, rotation: np.ndarray
 
 
 def _put_down_at(
-    world: SceneGeometry, name: str, target: Target, xy: np.ndarray, angle: float
+    world: SceneGeometry, name: str, target: Target, xy: np.ndarray, turn: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Position of the hand [3] that puts the origin over ``xy``, turned by ``angle``; and what that costs."""
+    """Position of the hand [3] that puts the origin over ``xy``, turned by ``turn`` [3, 3]; and what that costs."""
     config = world.config
-    turn = spun(np.eye(3), angle)
     middle = xy - (turn @ (world.snapshot.poses[name][:3] - world.hand))[:2]
     moved = (world.points(name) - world.hand) @ turn.T + np.append(middle, world.hand[2])
     near, walls = (

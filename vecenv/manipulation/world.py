@@ -45,6 +45,7 @@ class Margins:
         widest_turn: hands turn no further than this from home, radians.
         overhang_scale: sticking out this much of a box to fit in costs one point.
         grasp_tilts: of a hand from the vertical, tried where no upright one has room to grasp, radians.
+        place_tilts: of a hand that leans away from the robot to put something down out of an upright one's reach, radians.
         rim_scale: at a rim, standing out this much further is worth one point.
         tilt_scale: at a rim, leaning this much more costs one point, radians.
         entry_tilts: of a hand that enters a space from a side, from the vertical, radians.
@@ -74,6 +75,7 @@ class Margins:
     widest_turn: float = 1.75
     overhang_scale: float = 0.005
     grasp_tilts: tuple[float, ...] = ()
+    place_tilts: tuple[float, ...] = (0.2, 0.35, 0.5)
     rim_scale: float = 0.001
     tilt_scale: float = 0.2
     entry_tilts: tuple[float, ...] = (1.4, 1.1, 0.8)
