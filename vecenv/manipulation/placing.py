@@ -244,7 +244,9 @@ def _put_down_leaning(
     turn, places = rotation @ world.hand_rotation.T, (target.xy, target.cost)
     for tilt in world.config.place_tilts:
         lean = spun(leaning(tilt), heading) @ spun(np.eye(3), -heading)
-        options = [(*_put_down_at(world, name, target, xy, lean @ turn), cost) for xy, cost in zip(*places, strict=True)]
+        options = [
+            (*_put_down_at(world, name, target, xy, lean @ turn), cost) for xy, cost in zip(*places, strict=True)
+        ]
         for end, _, _ in sorted(options, key=lambda option: option[1] + option[2]):
             if _reaches(world, end, lean @ rotation):
                 return end, lean @ rotation

@@ -68,9 +68,7 @@ class RimGrasps:
         return len(self.far)
 
 
-def find_rim_grasps(
-    points: np.ndarray, gripper: Gripper = Gripper(), config: RimConfig = RimConfig()
-) -> RimGrasps:
+def find_rim_grasps(points: np.ndarray, gripper: Gripper = Gripper(), config: RimConfig = RimConfig()) -> RimGrasps:
     """Hands that hold an object by its rim.
 
     Args:
