@@ -6,8 +6,8 @@
 LIBERO-PRO changes words, objects, places or goals of LIBERO's suites. A task of a suite is a results folder below
 ``--work``, and ``--jobs`` processes of their own run the tasks side by side, each on its share of the cores. Episodes
 are stored as they end: the same command continues where it was stopped, and ``--report`` writes the rows of what is
-there. ``--scenes`` reads folders that ``vecenv compile`` wrote; LIBERO's packages are then not needed. A row is a suite,
-with a 95 % Wilson interval; ``failures`` in the results file has the episodes that were not solved, with their causes.
+there. ``--scenes`` reads a folder that ``vecenv compile`` wrote; LIBERO's packages are then not needed. A row is a
+suite, with a 95 % Wilson interval; ``failures`` in the results file has the episodes that were not solved, with causes.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def main() -> None:
 
 
 PRIVILEGED = (
-    "Ground truth of the simulator: names, poses and surface points of objects and parts, and grasps and places computed "
-    "on them. Programs are written by rules, not by a language model. Goals are not read."
+    "Ground truth of the simulator: names, poses and surface points of objects and parts, and grasps and places "
+    "computed on them. Programs are written by rules, not by a language model. Goals are not read."
 )
 
 
@@ -114,7 +114,7 @@ def run(jobs: Sequence[Job], processes: int) -> list[str]:
                 print(f"{count}/{len(jobs)} {job.suite}/{job.task}: {done.result()}", flush=True)
             except BrokenProcessPool:
                 causes.append(f"{job.suite}/{job.task}: its process, or one beside it, was killed (memory?)")
-            except Exception as error:  # noqa: BLE001  (other tasks go on; reported below, with a status)
+            except Exception as error:  # other tasks go on; the status says that one did not
                 causes.append(f"{job.suite}/{job.task}: {type(error).__name__}: {error}")
     return causes
 

@@ -232,7 +232,7 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
 def _put_down_leaning(
     world: SceneGeometry, name: str, target: Target, upright_hand: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`put_down` where the arm cannot take the pose: the hand leans away from the robot, and the object with it.
+    """As :func:`put_down` where the arm cannot take the pose: hand and object lean away from the robot.
 
     Let go, the object tips back on its base.
     """

@@ -68,7 +68,11 @@ class RimGrasps:
         return len(self.far)
 
 
-def find_rim_grasps(points: np.ndarray, gripper: Gripper = Gripper(), config: RimConfig = RimConfig()) -> RimGrasps:
+def find_rim_grasps(
+    points: np.ndarray,
+    gripper: Gripper = Gripper(),  # noqa: B008  (frozen)
+    config: RimConfig = RimConfig(),
+) -> RimGrasps:
     """Hands that hold an object by its rim.
 
     Args:
@@ -97,7 +101,7 @@ def find_rim_grasps(points: np.ndarray, gripper: Gripper = Gripper(), config: Ri
 def _rim(
     points: np.ndarray, middle: np.ndarray, inward: np.ndarray, config: RimConfig
 ) -> list[tuple[np.ndarray, float]]:
-    """The rim opposite to a direction, as a point [3], and its distance from the middle; nothing if none rises there."""
+    """The rim opposite to a direction, a point [3], and its distance from the middle; nothing if none rises there."""
     local = points - middle
     back, aside = -(local @ inward), np.abs(local @ np.array([-inward[1], inward[0], 0.0]))
     far = float(back.max())

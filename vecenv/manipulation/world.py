@@ -45,7 +45,8 @@ class Margins:
         widest_turn: hands turn no further than this from home, radians.
         overhang_scale: sticking out this much of a box to fit in costs one point.
         grasp_tilts: of a hand from the vertical, tried where no upright one has room to grasp, radians.
-        place_tilts: of a hand that leans away from the robot to put something down out of an upright one's reach, radians.
+        place_tilts: of a hand that leans away from the robot to put something down where an upright one does not reach,
+            radians.
         rim_scale: at a rim, standing out this much further is worth one point.
         tilt_scale: at a rim, leaning this much more costs one point, radians.
         entry_tilts: of a hand that enters a space from a side, from the vertical, radians.
