@@ -241,15 +241,16 @@ def _put_down_leaning(
         return upright_hand
     out = np.append(pos[:2] - world.base, 0.0) / max(float(np.linalg.norm(pos[:2] - world.base)), 1e-9)
     heading = float(np.arctan2(out[1], out[0]))
-    turn, places = rotation @ world.hand_rotation.T, (target.xy, target.cost)
+    turn = rotation @ world.hand_rotation.T
+    options = []
     for tilt in world.config.place_tilts:
         lean = spun(leaning(tilt), heading) @ spun(np.eye(3), -heading)
-        options = [
-            (*_put_down_at(world, name, target, xy, lean @ turn), cost) for xy, cost in zip(*places, strict=True)
-        ]
-        for end, _, _ in sorted(options, key=lambda option: option[1] + option[2]):
-            if _reaches(world, end, lean @ rotation):
-                return end, lean @ rotation
+        for xy, cost in zip(target.xy, target.cost + tilt / world.config.tilt_scale, strict=True):
+            end, extra = _put_down_at(world, name, target, xy, lean @ turn)
+            options.append((cost + extra, end, lean @ rotation))
+    for _, end, hand in sorted(options, key=lambda option: option[0]):
+        if _reaches(world, end, hand):
+            return end, hand
     return upright_hand
 
 

@@ -48,7 +48,7 @@ class Margins:
         place_tilts: of a hand that leans away from the robot to put something down where an upright one does not reach,
             radians.
         rim_scale: at a rim, standing out this much further is worth one point.
-        tilt_scale: at a rim, leaning this much more costs one point, radians.
+        tilt_scale: at a rim, and where it leans to put something down, leaning this much more costs one point, radians.
         entry_tilts: of a hand that enters a space from a side, from the vertical, radians.
         least_lift: the hand rises at least this much with what it holds.
         retreat: the hand backs off this far after releasing.
