@@ -259,8 +259,14 @@ class Llm:
         except NotUnderstood as error:
             raise NoRuleError(OFFLINE_MODEL, f"{OFFLINE_MODEL} does not understand: {error}") from error
         text, ended = cut(program, [f"\n{token}" for token in request["stop"]], request["max_tokens"])
-        unknown = {"prompt_tokens": None, "completion_tokens": None, "cost_usd": None}
-        return Reply(text=_until(request["stop"], text), model=OFFLINE_MODEL, finish_reason=ended, **unknown)
+        return Reply(
+            text=_until(request["stop"], text),
+            model=OFFLINE_MODEL,
+            finish_reason=ended,
+            prompt_tokens=None,
+            completion_tokens=None,
+            cost_usd=None,
+        )
 
     def _answered(self, request: Mapping[str, Any]) -> Any:
         """The provider's response, after as many attempts as it takes and is allowed."""

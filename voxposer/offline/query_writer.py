@@ -272,7 +272,7 @@ def _from_line(several: str, first: str, second: str) -> list[str]:
         "distances = []",
         f"for thing in {several}:",
         "    offset = (thing.position * cm)[:2] - start",
-        "    share = np.clip(np.dot(offset, way) / max(np.dot(way, way), 1e-6), 0, 1)",
+        "    share = np.clip(np.dot(offset, way) / np.maximum(np.dot(way, way), 1e-6), 0, 1)",
         "    distances.append(np.linalg.norm(offset - share * way))",
     ]
 
