@@ -38,6 +38,8 @@ _LAYERS = 2
 _WINDOW = 6
 # How often a path is planned again around places that the arm cannot reach, and how far from those, metres.
 _REPLANS, _AVOIDED = 2, 0.04
+# Distance of the places that are tried where a goal is out of reach, metres.
+_TRIED = 0.02
 # Points that would be nearer to a hand that is where it is do not count, metres.
 _CONTACT = 0.002
 # Rotations that differ by less need no room to turn, radians.
@@ -88,11 +90,16 @@ def plan_mapped(
         avoidance: what else to keep away from, 0 to 1, [N, N, N].
         planner: numbers of the planner.
         route: distances to keep, and prices.
-        exact: the goal is a grasp or a place; otherwise it may give way to obstacles by ``route.freed``.
+        exact: the goal is a grasp or a place; otherwise it may give way to obstacles by ``route.freed``, and to what
+            the arm can reach by ``route.nearer``. A place gives way to that alone, by ``route.aside``.
 
     Raises:
         OutOfReach: the arm cannot take the goal.
     """
+    if not exact:
+        goal = _within_reach(perception, goal, route.nearer)
+    elif closed and perception.held:  # a place, not a grasp
+        goal = _within_reach(perception, goal, route.aside, level=True)
     maps = _maps(perception, goal, closed=closed, avoidance=avoidance, route=route, exact=exact)
     found, price = None, maps.price
     for _ in range(_REPLANS + 1):
@@ -200,6 +207,29 @@ def _out_of_reach(perception: Perception, found: MappedPath, first: np.ndarray, 
         at = ", ".join(f"{x:.2f}" for x in way[-1])
         raise OutOfReach(f"the arm has no joint angles for the goal of a motion, the hand at {at}")
     return way[1:-1][~reached[1:-1]]
+
+
+def _within_reach(perception: Perception, goal: Stop, most: float, *, level: bool = False) -> Stop:
+    """A goal, or where the arm cannot take it, the nearest one in the workspace that it can; the same without one.
+
+    Args:
+        perception: the view.
+        goal: the pose to reach.
+        most: how far it may move, metres.
+        level: it moves horizontally.
+    """
+    base, rotation = perception.snapshot.panda_base, matrix(goal.quat)
+    if base is None or PandaArm(base).reaches(goal.pos[None], rotation[None])[0]:
+        return goal
+    ticks = np.arange(-most, most + _TRIED / 2, _TRIED)
+    moves = np.stack(np.meshgrid(ticks, ticks, [0.0] if level else ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    far = np.linalg.norm(moves, axis=1)
+    for move in moves[np.argsort(far, kind="stable")][: int((far <= most).sum())]:
+        at = goal.pos + move
+        inside = (at >= perception.grid.lo).all() and (at <= perception.grid.hi).all()
+        if inside and PandaArm(base).reaches(at[None], rotation[None])[0]:
+            return replace(goal, pos=at)
+    return goal
 
 
 def _near_any(lattice: Lattice, places: np.ndarray) -> np.ndarray:

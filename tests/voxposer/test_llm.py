@@ -296,6 +296,30 @@ assert dict(os.environ) == before, set(os.environ) ^ set(before)
 """
 
 
+WITHOUT_LITELLM = """
+import sys
+sys.modules["litellm"] = None
+from voxposer.language.llm import Llm, LlmConfig
+from voxposer.language.replies import NoRuleError
+llm = Llm(LlmConfig(model="offline/libero"))
+def ask(query):
+    prompt = "Queries are for `planner`"
+    question = f"objects = ['mug_1', 'plate_1']\\n# Query: {query}"
+    return llm.complete([{"role": "system", "content": prompt}, {"role": "user", "content": question}], max_tokens=512)
+print("grasp the mug" in ask("put the mug on the plate.").text)
+try:
+    ask("sing.")
+except NoRuleError as error:
+    print(error)
+"""
+
+
+def test_the_rule_base_needs_no_litellm() -> None:
+    run = subprocess.run([sys.executable, "-c", WITHOUT_LITELLM], capture_output=True, text=True, timeout=120)
+    assert run.stdout.splitlines()[0] == "True", run.stderr
+    assert "offline/libero does not understand: no known verb" in run.stdout
+
+
 def test_litellm_is_imported_late_without_network_env_files_or_output(tmp_path: Path) -> None:
     (tmp_path / ".env").write_text("FROM_A_FILE=1\n")
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=False, cwd=tmp_path)

@@ -250,6 +250,13 @@ def test_positions_resolve_ambiguous_words(phrase: str, found: str) -> None:
     assert thing["name"] == found
 
 
+@pytest.mark.parametrize(("phrase", "found"), [("between", "bowl_1"), ("not between", "bowl_2")])
+def test_between_is_near_the_line_and_not_only_near_its_middle(phrase: str, found: str) -> None:
+    things = {"plate_1": (-0.3, 0.0, 0.0), "mug_1": (0.3, 0.0, 0.0), "bowl_1": (0.22, 0.02, 0.0)}
+    world = ToyWorld(scene(things | {"bowl_2": (0.0, 0.15, 0.0)}), size=100)
+    assert world.detected(f"the bowl {phrase} the plate and the mug")["name"] == found
+
+
 def test_on_is_distinguished_from_beside_and_below_by_heights() -> None:
     stacked = ToyWorld(
         scene(

@@ -126,7 +126,7 @@ def test_examples_use_only_existing_functions_and_fields(example: Example) -> No
     called = {node.func.id for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
     assert called <= CALLABLE[example.lmp] | {"sum", "len"}
     read = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    of_numpy = {"append", "array", "linalg", "norm", "argmin", "argmax", "maximum", "pi", "cos", "sin"}
+    of_numpy = {"append", "array", "clip", "dot", "linalg", "norm", "argmin", "argmax", "maximum", "pi", "cos", "sin"}
     assert read <= FIELDS | of_numpy
 
 

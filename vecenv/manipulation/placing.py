@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vecenv.manipulation.grasps import Grasps, Gripper, clearance, find_grasps, room_around
+from vecenv.manipulation.reach import PandaArm
+from vecenv.manipulation.rims import find_rim_grasps
 from vecenv.manipulation.world import Margins, SceneGeometry, around, down_facing, leaning, spun, upright, yaw
 
 
@@ -65,7 +67,7 @@ def choose_grasp(
     """The best grasp of an object among its neighbours, or None when it offers nothing to hold.
 
     The open hand is tried first, pointing down; where neighbours leave it no room, the hand with half-closed fingers
-    and the hand that leans to some side.
+    and the hand that leans to some side. A dish without faces to hold is taken by its rim.
 
     Args:
         world: the scene.
@@ -76,6 +78,9 @@ def choose_grasp(
     wide = _best_grasp(world, name, failed, world.config.gripper)
     if wide is not None and wide[1] > world.config.least_room:
         return wide[0]
+    rim = wide is None and _rim_grasp(world, name, failed)
+    if rim:
+        return rim
     half_closed = narrow and _best_grasp(world, name, failed, world.config.gripper.narrowed(world.config.narrow))
     for tilt in world.config.grasp_tilts if wide is None or wide[1] < 0 else ():
         leant = _tilted_grasp(world, name, failed, tilt)
@@ -105,7 +110,7 @@ def _best_grasp(
     origin = world.snapshot.poses[name][:3]
     for pos in failed:
         score = score - 5.0 * (np.linalg.norm(grasps.pos - origin - pos, axis=1) < config.retry_radius)
-    best = int(score.argmax())
+    best = _first_reached(world, score, grasps.pos, rotations)
     narrow = gripper.half_opening < config.gripper.half_opening
     return Grasped(grasps.pos[best], rotations[best], float(grasps.width[best]), narrow), float(room[best])
 
@@ -132,9 +137,59 @@ def _tilted_grasp(world: SceneGeometry, name: str, failed: Sequence[np.ndarray],
             tried = np.linalg.norm(pos - world.snapshot.poses[name][:3] - place, axis=1) < config.retry_radius
             score = score - 5.0 * tried
         score = np.where(room > config.least_room, score, -np.inf)
-        i = int(score.argmax()) if len(score) else -1
+        i = _first_reached(world, score, pos, rotations) if len(score) else -1
         if i >= 0 and score[i] > highest:
             best, highest = Grasped(pos[i], rotations[i], float(grasps.width[i])), float(score[i])
+    return best
+
+
+def _rim_grasp(world: SceneGeometry, name: str, failed: Sequence[np.ndarray]) -> Grasped | None:
+    """The best grasp of a dish by its rim that has room and that the arm can take; None if there is none."""
+    config, points = world.config, world.points(name)
+    grasps = find_rim_grasps(points, config.gripper)
+    if not len(grasps):
+        return None
+    near = around(points.mean(axis=0)[:2], np.concatenate([world.others(name), world.walls]), config.neighbours)
+    near = near[near[:, 2] > points[:, 2].min() + config.least_room]
+    hands = zip(grasps.pos, grasps.rotation, strict=True)
+    rooms = np.array([_room_ahead(*hand, near, config.gripper) for hand in hands])
+    score = grasps.far / config.rim_scale + np.minimum(rooms, config.ample_room) / config.room_scale
+    score = score - np.abs(yaw(grasps.rotation)) / config.turn_scale - _reach_cost(world, grasps.pos)
+    score = score - grasps.tilt / config.tilt_scale
+    for place in failed:
+        tried = np.linalg.norm(grasps.pos - world.snapshot.poses[name][:3] - place, axis=1) < config.retry_radius
+        score = score - 5.0 * tried
+    fits = rooms > config.least_room
+    if not fits.any():
+        return None
+    i = _first_reached(world, np.where(fits, score, -np.inf), grasps.pos, grasps.rotation)
+    return Grasped(grasps.pos[i], grasps.rotation[i], config.gripper.half_opening)
+
+
+def _room_ahead(pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gripper: Gripper) -> float:
+    """Room around an open hand at a pose and on its way there along its own axis, metres."""
+    local = (obstacles - pos) @ rotation @ down_facing(np.array([[0.0, 1.0, 0.0]]))[0].T
+    here = Grasps(np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), np.zeros(1), np.zeros(1))
+    return float(clearance(here, local, gripper)[0])
+
+
+def _reaches(world: SceneGeometry, pos: np.ndarray, rotation: np.ndarray) -> bool:
+    """Whether the arm can take a pose; True for an arm that is not known."""
+    base = world.snapshot.panda_base
+    return base is None or bool(PandaArm(base).reaches(pos[None], rotation[None])[0])
+
+
+def _first_reached(world: SceneGeometry, score: np.ndarray, pos: np.ndarray, rotations: np.ndarray) -> int:
+    """Row of the best hand that the arm can take; of the best one if it can take none, or if the arm is not known."""
+    best = int(score.argmax())
+    if world.snapshot.panda_base is None:
+        return best
+    arm = PandaArm(world.snapshot.panda_base)
+    for i in np.argsort(-score, kind="stable"):
+        if np.isneginf(score[i]):
+            break
+        if arm.reaches(pos[i][None], rotations[i][None])[0]:
+            return int(i)
     return best
 
 
@@ -168,10 +223,35 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
         for xy, cost in zip(target.xy, target.cost + abs(angle) / world.config.turn_scale, strict=True):
             if cost >= lowest:  # costs ascend and nothing makes them less
                 break
-            end, extra = _put_down_at(world, name, target, xy, angle)
+            end, extra = _put_down_at(world, name, target, xy, spun(np.eye(3), angle))
             if cost + extra < lowest:
                 best, lowest = (end, spun(rotation, angle)), cost + extra
-    return best
+    return best if _reaches(world, *best) else _put_down_leaning(world, name, target, best)
+
+
+def _put_down_leaning(
+    world: SceneGeometry, name: str, target: Target, upright_hand: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`put_down` where the arm cannot take the pose: hand and object lean away from the robot.
+
+    Let go, the object tips back on its base.
+    """
+    pos, rotation = upright_hand
+    if world.base is None:
+        return upright_hand
+    out = np.append(pos[:2] - world.base, 0.0) / max(float(np.linalg.norm(pos[:2] - world.base)), 1e-9)
+    heading = float(np.arctan2(out[1], out[0]))
+    turn = rotation @ world.hand_rotation.T
+    options = []
+    for tilt in world.config.place_tilts:
+        lean = spun(leaning(tilt), heading) @ spun(np.eye(3), -heading)
+        for xy, cost in zip(target.xy, target.cost + tilt / world.config.tilt_scale, strict=True):
+            end, extra = _put_down_at(world, name, target, xy, lean @ turn)
+            options.append((cost + extra, end, lean @ rotation))
+    for _, end, hand in sorted(options, key=lambda option: option[0]):
+        if _reaches(world, end, hand):
+            return end, hand
+    return upright_hand
 
 
 def put_in(world: SceneGeometry, name: str, target: Target, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -240,11 +320,10 @@ def _turns(world: SceneGeometry, name: str, target: Target, rotation: np.ndarray
 
 
 def _put_down_at(
-    world: SceneGeometry, name: str, target: Target, xy: np.ndarray, angle: float
+    world: SceneGeometry, name: str, target: Target, xy: np.ndarray, turn: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Position of the hand [3] that puts the origin over ``xy``, turned by ``angle``; and what that costs."""
+    """Position of the hand [3] that puts the origin over ``xy``, turned by ``turn`` [3, 3]; and what that costs."""
     config = world.config
-    turn = spun(np.eye(3), angle)
     middle = xy - (turn @ (world.snapshot.poses[name][:3] - world.hand))[:2]
     moved = (world.points(name) - world.hand) @ turn.T + np.append(middle, world.hand[2])
     near, walls = (

@@ -50,6 +50,8 @@ class RouteConfig:
         touch: in maps, a hand that comes or goes along its own axis may be so far inside something: samples of surfaces
             and voxels are not exact.
         freed: in maps, a goal that is neither grasp nor place gives way to obstacles by at most this much.
+        nearer: in maps, a goal that is neither grasp nor place gives way to the arm's reach by at most this much.
+        aside: in maps, a place that the arm cannot reach moves horizontally by at most this much.
         near_price: in maps, price of a metre that touches something, beyond that of a free one, which is 1.
         hit_price: in maps, price of a metre inside something or where the program wants none.
         deep_price: in maps, price of a metre for each metre of depth inside something.
@@ -74,6 +76,8 @@ class RouteConfig:
     turning: float = 0.012
     touch: float = 0.006
     freed: float = 0.12
+    nearer: float = 0.18
+    aside: float = 0.07
     near_price: float = 15.0
     hit_price: float = 50.0
     deep_price: float = 4000.0

@@ -45,6 +45,10 @@ class Margins:
         widest_turn: hands turn no further than this from home, radians.
         overhang_scale: sticking out this much of a box to fit in costs one point.
         grasp_tilts: of a hand from the vertical, tried where no upright one has room to grasp, radians.
+        place_tilts: of a hand that leans away from the robot to put something down where an upright one does not reach,
+            radians.
+        rim_scale: at a rim, standing out this much further is worth one point.
+        tilt_scale: at a rim, and where it leans to put something down, leaning this much more costs one point, radians.
         entry_tilts: of a hand that enters a space from a side, from the vertical, radians.
         least_lift: the hand rises at least this much with what it holds.
         retreat: the hand backs off this far after releasing.
@@ -72,6 +76,9 @@ class Margins:
     widest_turn: float = 1.75
     overhang_scale: float = 0.005
     grasp_tilts: tuple[float, ...] = ()
+    place_tilts: tuple[float, ...] = (0.2, 0.35, 0.5)
+    rim_scale: float = 0.001
+    tilt_scale: float = 0.2
     entry_tilts: tuple[float, ...] = (1.4, 1.1, 0.8)
     least_lift: float = 0.08
     retreat: float = 0.08

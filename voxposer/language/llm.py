@@ -10,7 +10,7 @@ Complete replies are kept on disk (``voxposer.language.reply_cache``). The offli
 only: they cost nothing, and another version may write others. Threads that ask the same at the same time share one
 request.
 
-Needs the extra ``voxposer``; litellm is imported at the first question.
+Needs the extra ``voxposer``; litellm is imported at the first question. The rule base answers without it.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 from voxposer.language import providers
 from voxposer.language.replies import LlmError, Message, NoRuleError, Reply, ReplyError, Usage
 from voxposer.language.reply_cache import cache_at
+from voxposer.offline.names import NotUnderstood
 from voxposer.offline.provider import MODEL as OFFLINE_MODEL
-from voxposer.offline.provider import register
+from voxposer.offline.provider import cut, write
 
 if TYPE_CHECKING:
     from tenacity import RetryCallState
@@ -238,7 +239,11 @@ class Llm:
 
     def _with_retries(self, request: Mapping[str, Any]) -> Reply:
         model = self.config.model
-        reply = self._reply(self._answered(request), request["stop"])
+        reply = (
+            self._by_rule(request)
+            if self.config.is_rule_base
+            else self._reply(self._answered(request), request["stop"])
+        )
         self._count(Usage(calls=1) if self.config.is_rule_base else Usage.of(reply))
         if reply.finish_reason == "length":
             limit = request["max_tokens"]
@@ -247,15 +252,30 @@ class Llm:
             raise ReplyError(model, f"the answer is empty (it ended with {reply.finish_reason!r})", reply=reply)
         return reply
 
+    def _by_rule(self, request: Mapping[str, Any]) -> Reply:
+        """The rule base's answer, which needs no litellm."""
+        try:
+            program = write(request["messages"])
+        except NotUnderstood as error:
+            raise NoRuleError(OFFLINE_MODEL, f"{OFFLINE_MODEL} does not understand: {error}") from error
+        text, ended = cut(program, [f"\n{token}" for token in request["stop"]], request["max_tokens"])
+        return Reply(
+            text=_until(request["stop"], text),
+            model=OFFLINE_MODEL,
+            finish_reason=ended,
+            prompt_tokens=None,
+            completion_tokens=None,
+            cost_usd=None,
+        )
+
     def _answered(self, request: Mapping[str, Any]) -> Any:
         """The provider's response, after as many attempts as it takes and is allowed."""
         litellm, tenacity = providers.litellm(), providers.tenacity()
         doubling = tenacity.wait_exponential(multiplier=self.config.backoff_s, max=self.config.backoff_max_s)
         pauses = doubling + tenacity.wait_random(0, min(self.config.backoff_s, 1.0))
-        most = 1 if self.config.is_rule_base else self.config.attempts
         retrying = tenacity.Retrying(
             retry=tenacity.retry_if_exception(self._may_pass),
-            stop=tenacity.stop_after_attempt(most) | tenacity.stop_when_event_set(self._closed),
+            stop=tenacity.stop_after_attempt(self.config.attempts) | tenacity.stop_when_event_set(self._closed),
             wait=lambda state: self._pause(state, pauses),
             before_sleep=lambda state: self._count(Usage(retries=1)),
             sleep=self._sleep,
@@ -269,8 +289,6 @@ class Llm:
     def _error(self, error: Exception, attempts: int) -> LlmError:
         """What a request ended with, as one of ours."""
         model = self.config.model
-        if self.config.is_rule_base:
-            return NoRuleError(model, providers.first_line(error))
         if self._lacks_key():
             return LlmError(model, providers.reason(error, model), permanent=True)
         tries = f" ({attempts} attempts)" if attempts > 1 else ""
@@ -284,8 +302,6 @@ class Llm:
         return self.config.api_key is None and providers.lacks_key(self.config.model)
 
     def _attempt(self, litellm: ModuleType, request: Mapping[str, Any]) -> Any:
-        if self.config.is_rule_base:
-            register()
         return litellm.completion(
             **{"max_retries": 0, "num_retries": 0, "drop_params": True},
             **request["options"],
@@ -308,7 +324,7 @@ class Llm:
         if not choices:
             raise ReplyError(self.config.model, "the response has no answer in it")
         sent, made = _tokens(response)
-        unknown = self.config.is_rule_base or sent is None
+        unknown = sent is None
         return Reply(
             text=_until(stop, _characters(choices[0].message.content or "")),
             model=response.model or self.config.model,

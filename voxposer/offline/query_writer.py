@@ -79,7 +79,11 @@ class _Locator:
             "high",
             "low",
             "middle",
+            "offset",
+            "share",
+            "start",
             "thing",
+            "way",
         }
 
     def locate(self, noun: Noun, inside: str = "") -> tuple[list[str], str]:
@@ -176,8 +180,12 @@ class _Locator:
     def _by_relation(self, relation: Relation, several: str) -> tuple[list[str], str]:
         if relation.kind in _BESIDE:
             return self._beside(relation, several)
-        lines, goal = self._goal(relation)
         away = relation.negated != (relation.kind == "outside")
+        if relation.kind == "between" and len(relation.refs) == 2:
+            lines, ends = self._ends(relation)
+            lines += [*self._scale(), *_from_line(several, *ends)]
+            return lines, f"{several}[np.{'argmax' if away else 'argmin'}(distances)]"
+        lines, goal = self._goal(relation)
         if _is_on(relation):
             lines += [*self._scale(), *_gaps(several, goal.removesuffix(".position"))]
         else:
@@ -186,18 +194,23 @@ class _Locator:
 
     def _goal(self, relation: Relation) -> tuple[list[str], str]:
         """The point that the wanted object is closest to: the other object, or the middle of two."""
-        lines, points = [], []
-        for ref in relation.refs:
-            more, expression = self.locate(ref, "on" if relation.kind == "from" else relation.kind)
-            name = self._name(variable(" ".join(ref.words)))
-            lines += [*more, f"{name} = {expression}"]
-            points.append(f"{name}.position")
+        lines, points = self._ends(relation)
         if relation.kind == "between" and len(points) == 1:
             name = points[0].removesuffix(".position")
             return [*lines, f"middle = sum([thing.position for thing in {name}]) / len({name})"], "middle"
         if len(points) == 2:
             return [*lines, f"middle = ({points[0]} + {points[1]}) / 2"], "middle"
         return lines, points[0]
+
+    def _ends(self, relation: Relation) -> tuple[list[str], list[str]]:
+        """The positions of the other objects."""
+        lines, points = [], []
+        for ref in relation.refs:
+            more, expression = self.locate(ref, "on" if relation.kind == "from" else relation.kind)
+            name = self._name(variable(" ".join(ref.words)))
+            lines += [*more, f"{name} = {expression}"]
+            points.append(f"{name}.position")
+        return lines, points
 
     def _beside(self, relation: Relation, several: str) -> tuple[list[str], str]:
         """The closest one on one side of an object."""
@@ -249,6 +262,18 @@ def _gaps(several: str, support: str) -> list[str]:
         "    foot[2] = thing.aabb[0][2]",
         "    gap = np.maximum(np.maximum(face - foot, foot - high), 0)",
         "    distances.append(np.linalg.norm(gap * cm))",
+    ]
+
+
+def _from_line(several: str, first: str, second: str) -> list[str]:
+    """Distance of each object from the line between two positions: what is beside one end is nearly between them."""
+    return [
+        f"start, way = ({first} * cm)[:2], (({second} - {first}) * cm)[:2]",
+        "distances = []",
+        f"for thing in {several}:",
+        "    offset = (thing.position * cm)[:2] - start",
+        "    share = np.clip(np.dot(offset, way) / np.maximum(np.dot(way, way), 1e-6), 0, 1)",
+        "    distances.append(np.linalg.norm(offset - share * way))",
     ]
 
 
