@@ -151,7 +151,7 @@ def test_a_closed_database_is_one_file_that_reading_leaves_alone(tmp_path: Path)
     store.append([record()])
     store.close()
     assert len(ResultStore.open(store.folder).records()) == 1
-    assert {path.name for path in store.folder.iterdir()} == {"config.json", "episodes.sqlite"}
+    assert {path.name for path in store.folder.iterdir()} == {".lock", "config.json", "episodes.sqlite"}
     store.append([record(0, 1)])  # it opens again
     assert len(store.records()) == 2
 
@@ -322,7 +322,7 @@ def test_a_reward_that_is_not_finite_is_written_as_null(store: ResultStore) -> N
     assert store.records()[Episode("s", 0, 0)].reward is None
 
 
-@given(cut=st.integers(1, 60))
+@given(cut=st.integers(2, 60))
 def test_a_cut_off_last_line_costs_that_episode_only(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
     store = ResultStore.create(tmp_path_factory.mktemp("results") / "run", {})
     store.append([record(0, 0), record(0, 1)])
@@ -332,6 +332,16 @@ def test_a_cut_off_last_line_costs_that_episode_only(tmp_path_factory: pytest.Te
     reopened = ResultStore.open(store.folder)
     reopened.append([record(0, 2)])
     assert list(reopened.records()) == [Episode("s", 0, 0), Episode("s", 0, 2)]
+
+
+def test_a_row_of_which_only_the_newline_was_cut_off_is_kept(store: ResultStore) -> None:
+    store.append([record(0, 0), record(0, 1)])
+    path = store.folder / "episodes.jsonl"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert len(store.records()) == 2
+    reopened = ResultStore.open(store.folder)
+    reopened.append([record(0, 2)])
+    assert len(reopened.records()) == 3
 
 
 def test_a_damaged_line_further_up_is_named(store: ResultStore) -> None:

@@ -1,9 +1,62 @@
-"""Files that are whole after a crash or a power cut: replaced in one step, or appended to and synced."""
+"""Files that are whole after a crash or a power cut: replaced in one step, or appended to and synced.
+
+:func:`read_json` reads what may be damaged or a stranger's, with limits on its size, depth and numbers.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
+from typing import Any
+
+from vecenv_eval.store.record import LARGEST, StoreError
+
+# Bytes of a JSON file, and levels of objects and lists in each other; ours have less than 1 MB and 10 levels.
+MOST_BYTES, MOST_LEVELS = 1 << 28, 64
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises:
+        OSError: the file cannot be read.
+        StoreError: it is larger than `MOST_BYTES`, is no JSON object, or holds what `parse_json` refuses.
+    """
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise StoreError(f"{path} cannot be read: it has {size:,} bytes, more than {MOST_BYTES:,}")
+    try:
+        content = parse_json(path.read_bytes())
+    except ValueError as error:
+        raise StoreError(f"{path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise StoreError(f"{path} cannot be read: it holds no JSON object")
+    return content
+
+
+def parse_json(text: bytes) -> Any:
+    """Plain values from JSON in UTF-8.
+
+    Raises:
+        ValueError: it is none, its levels are too deep, or it holds a number that is too large.
+    """
+    try:
+        value = json.loads(text.decode("utf-8"))
+    except RecursionError:
+        raise ValueError(f"more than {MOST_LEVELS} levels of JSON") from None
+    _check(value, MOST_LEVELS)
+    return value
+
+
+def _check(value: Any, levels: int) -> None:
+    """Refuse depth, and numbers that nothing else could store."""
+    if levels < 0:
+        raise ValueError(f"more than {MOST_LEVELS} levels of JSON")
+    if isinstance(value, dict | list):
+        for each in value.values() if isinstance(value, dict) else value:
+            _check(each, levels - 1)
+    elif isinstance(value, int) and abs(value) > LARGEST:
+        raise ValueError(f"a whole number has {len(str(abs(value)))} digits, more than can be stored")
 
 
 def append_text(path: Path, text: str) -> None:

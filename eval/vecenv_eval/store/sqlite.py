@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from vecenv_eval.episodes import Episode
+from vecenv_eval.store.files import parse_json
 from vecenv_eval.store.filesystems import file_system, is_local
 from vecenv_eval.store.record import Record, StoreError, StoreWriteError, from_plain, to_plain
 
@@ -49,6 +50,8 @@ COLUMNS = {
     "parts": "JSON NOT NULL",
 }
 KEY = ("suite", "task", "episode")
+# Truth values as SQLite stores them.
+_FLAGS = {0: False, 1: True}
 _NAMES = ", ".join(COLUMNS)
 _CREATE = f"CREATE TABLE episodes ({', '.join(map(' '.join, COLUMNS.items()))}, PRIMARY KEY ({', '.join(KEY)}))"
 # As Record.replaces: the latest record counts, but no error replaces a verdict.
@@ -196,11 +199,13 @@ class SqliteRows:
 
     def _record(self, values: Mapping[str, Any]) -> Record:
         try:
-            flags = {name: bool(values[name]) for name, kind in COLUMNS.items() if kind.startswith("BOOLEAN")}
-            texts = {name: json.loads(values[name]) for name, kind in COLUMNS.items() if kind.startswith("JSON")}
+            flags = {name: _FLAGS.get(values[name]) for name, kind in COLUMNS.items() if kind.startswith("BOOLEAN")}
+            texts = {
+                name: parse_json(str(values[name]).encode()) for name, kind in COLUMNS.items() if kind.startswith("JSON")
+            }
             return from_plain({**values, **flags, **texts})
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            which = "/".join(str(values[name]) for name in KEY)
+        except (ValueError, TypeError) as error:
+            which = "/".join(f"{values[name]!s:.50}" for name in KEY)
             raise StoreError(f"{self.path}: the row of {which} is not an episode: {error}") from None
 
     @contextmanager
