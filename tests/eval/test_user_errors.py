@@ -65,8 +65,7 @@ def assert_one_sentence(done: Result, *words: str, status: int = 2) -> None:
 VERBS = "    def reset(self, env, info): ...\n    def act(self, env): ...\n"
 BAD_POLICIES = {
     "raises": (
-        "class P:\n    name = 'p'\n    def __init__(self):\n        raise OSError('no weights in /models')\n"
-        + VERBS,
+        "class P:\n    name = 'p'\n    def __init__(self):\n        raise OSError('no weights in /models')\n" + VERBS,
         "P",
     ),
     "exits": ("import sys\nclass P:\n    def __init__(self):\n        sys.exit('bye')\n" + VERBS, "P"),

@@ -3,8 +3,8 @@
 Options or a YAML file come in; a progress bar, a table with Wilson 95 % intervals and the path of the results folder
 come out (``vecenv_eval.cli.screen``), or one JSON object a line with ``--json`` (``vecenv_eval.cli.json_lines``). The
 exit status is 0 when every episode has a verdict, 1 when some have none, 2 when the arguments are wrong or the results
-folder cannot be read or written, 130 after Ctrl-C and 143 after SIGTERM (what was computed is kept, and the command that
-resumes it is printed).
+folder cannot be read or written, 130 after Ctrl-C and 143 after SIGTERM (what was computed is kept, and the command
+that resumes it is printed).
 """
 
 from __future__ import annotations
@@ -174,9 +174,7 @@ def _resume(folder: Path, given: dict[str, Any], file: Path | None, out: Path | 
     return Evaluation(config), store
 
 
-def _refuse_settings(
-    folder: Path, given: dict[str, Any], file: Path | None, out: Path | None
-) -> None:
+def _refuse_settings(folder: Path, given: dict[str, Any], file: Path | None, out: Path | None) -> None:
     """Refuse settings that the folder holds already, but those that may have to be given again."""
     refused = [
         *(

@@ -30,7 +30,7 @@ class Stop:
 
 @contextmanager
 def stopping() -> Iterator[Stop]:
-    """Inside the context, SIGTERM raises `Terminated` in the main thread, unless the caller of the process ignores it."""
+    """Inside the context, SIGTERM raises `Terminated` in the main thread, unless something else handles or ignores it."""
     stop = Stop()
 
     def terminate(number: int, frame: FrameType | None) -> None:

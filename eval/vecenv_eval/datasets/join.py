@@ -60,7 +60,9 @@ def copy_episodes(source: Path, target: Path, episodes: Collection[Episode]) -> 
         raise
     except DAMAGE as error:
         text = " ".join(str(error).split())
-        raise DatasetError(f"{source} cannot be read as a LeRobot dataset: {type(error).__name__}: {text:.300}") from None
+        raise DatasetError(
+            f"{source} cannot be read as a LeRobot dataset: {type(error).__name__}: {text:.300}"
+        ) from None
     finally:
         added = len(writer.added)
         writer.close()
@@ -94,8 +96,12 @@ class _Joiner(LeRobotWriter):
         """Add one episode, given its row in the source's ``meta/episodes``."""
         cameras = self._check(source, info, key)
         columns = _frames(source, info, row)
-        where = {camera: _numbers(row, f"videos/{camera}/chunk_index", f"videos/{camera}/file_index") for camera in cameras}
-        videos = {camera: self._copied(source / files.VIDEO.format(*where[camera], key=camera), camera) for camera in cameras}
+        where = {
+            camera: _numbers(row, f"videos/{camera}/chunk_index", f"videos/{camera}/file_index") for camera in cameras
+        }
+        videos = {
+            camera: self._copied(source / files.VIDEO.format(*where[camera], key=camera), camera) for camera in cameras
+        }
         stats = files.statistics_of(row)
         images = {camera: stats[camera] for camera in cameras}
         self._add(columns, images, videos, {name: row[name] for name in _ABOUT})

@@ -120,8 +120,8 @@ class LeRobotWriter:
         done = None if self._verdicts is None else frozenset(self._verdicts())
         if done is not None and (strangers := sorted(frozenset(self._written) - done)):
             raise DatasetError(
-                f"{self.root} holds {strangers[0].id}, which has no verdict in these results: if they were merged, merge "
-                "them again, else move the dataset away"
+                f"{self.root} holds {strangers[0].id}, which has no verdict in these results: if they were merged, "
+                "merge them again, else move the dataset away"
             )
         kept: dict[Episode | int, Waiting] = {}
         for folder in waiting.folders(self.root):
@@ -132,7 +132,10 @@ class LeRobotWriter:
             if done is not None and each.key not in done:
                 waiting.remove(folder)
                 continue
-            kept[len(kept) if done is None else each.key] = each
+            name = len(kept) if done is None else each.key
+            if name in kept:
+                waiting.remove(kept[name].folder)
+            kept[name] = each
         found = list(kept.values())
         if found and "fps" not in self._info:
             self._info |= dict(found[0].info)

@@ -1,9 +1,9 @@
 """Episodes of a LeRobot dataset that are on the disk and not yet in its files.
 
-The files of a dataset hold many episodes each, so an episode cannot be added to them when it ends. Until it is, it has a
-folder of its own, ``.pending/NUMBER``: its frames, its videos and what is told about it. The folder appears in one step
-and its number is the episode's index in the dataset, so that after a crash it is plain which episodes are in the files
-(those below ``total_episodes``) and which still wait.
+The files of a dataset hold many episodes each, so an episode cannot be added to them when it ends. Until it is, it has
+a folder of its own, ``.pending/NUMBER``: its frames, its videos and what is told about it. The folder appears in one
+step and its number is the episode's index in the dataset, so that after a crash it is plain which episodes are in the
+files (those below ``total_episodes``) and which still wait.
 """
 
 from __future__ import annotations
@@ -30,8 +30,18 @@ if TYPE_CHECKING:
 
 PENDING, PARTIAL = ".pending", ".partial"
 _FRAMES, _ABOUT = "frames.parquet", "about.json"
-# What pyarrow, NumPy and json raise over files that are damaged or hold something else; pyarrow's errors derive from these.
-DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, OverflowError, MemoryError)
+# What pyarrow, NumPy and json raise over files that are damaged or hold something else.
+DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    IndexError,
+    RecursionError,
+    OverflowError,
+    MemoryError,
+)
 
 
 class DatasetError(InvalidFile):

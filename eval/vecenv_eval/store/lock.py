@@ -28,8 +28,8 @@ LOCK, HOST = ".lock", ".lock.host"
 _IN_USE = (errno.EACCES, errno.EAGAIN)
 # Bytes of the text in a lock's file.
 _MOST = 400
-# Folders that this process has locked, and the process and thread that did. A record lock belongs to a process, and ends
-# when any handle on the file closes.
+# Folders that this process has locked, and the process and thread that did. A record lock belongs to a process, and
+# ends when any handle on the file closes.
 _HELD: dict[Path, tuple[int, int]] = {}
 _GUARD = threading.Lock()
 

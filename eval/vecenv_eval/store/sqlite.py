@@ -201,7 +201,9 @@ class SqliteRows:
         try:
             flags = {name: _FLAGS.get(values[name]) for name, kind in COLUMNS.items() if kind.startswith("BOOLEAN")}
             texts = {
-                name: parse_json(str(values[name]).encode()) for name, kind in COLUMNS.items() if kind.startswith("JSON")
+                name: parse_json(str(values[name]).encode())
+                for name, kind in COLUMNS.items()
+                if kind.startswith("JSON")
             }
             return from_plain({**values, **flags, **texts})
         except (ValueError, TypeError) as error:
