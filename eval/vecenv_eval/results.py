@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from vecenv_eval.conditions import checked_content
 from vecenv_eval.config import ConfigError, EvalConfig, differences
 from vecenv_eval.episodes import Episode, Suite
 from vecenv_eval.policies import BUILTIN
@@ -136,7 +137,7 @@ def read_folder(folder: Path) -> tuple[EvalConfig, ResultStore]:
     """
     store = ResultStore.open(folder)
     try:
-        return EvalConfig.from_dict(store.config()["config"]), store
+        return EvalConfig.from_dict(checked_content(store.config(), folder / CONFIG)["config"]), store
     except KeyError as error:
         raise StoreError(f"{folder / CONFIG} does not hold an evaluation: it has no {error}") from None
     except (TypeError, AttributeError, ConfigError) as error:

@@ -30,7 +30,7 @@ class Stop:
 
 @contextmanager
 def stopping() -> Iterator[Stop]:
-    """Inside the context, SIGTERM raises `Terminated` in the main thread, unless something else handles or ignores it."""
+    """Inside the context, SIGTERM raises `Terminated` in the main thread, unless it is handled or ignored already."""
     stop = Stop()
 
     def terminate(number: int, frame: FrameType | None) -> None:

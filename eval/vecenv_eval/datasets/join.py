@@ -136,11 +136,9 @@ class _Joiner(LeRobotWriter):
 
 def _frames(source: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """An episode's frames, by feature: [T, n] or [T]; without the indices in the dataset."""
-    import pyarrow.compute as pc
-
     path = source / files.DATA.format(*_numbers(row, "data/chunk_index", "data/file_index"))
     table = files.table(path)
-    table = table.filter(pc.equal(table["episode_index"], row["episode_index"]))
+    table = table.filter(waiting.array_of(table, "episode_index") == row["episode_index"])
     if table.num_rows != row["length"]:
         raise DatasetError(f"{source}: episode {row['episode_index']} has {table.num_rows} frames, not {row['length']}")
     found = {}

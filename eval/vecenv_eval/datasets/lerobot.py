@@ -95,7 +95,8 @@ class LeRobotWriter:
         self._rollouts: dict[int, _Rollout] = {}
         self._verdicts = verdicts
         there = files.open_to_write(root)
-        self._info, self._tasks, self._stats, self._files = there.info, there.tasks, there.stats, there.files
+        self._info: dict[str, Any] = dict(there.info)
+        self._tasks, self._stats, self._files = there.tasks, there.stats, there.files
         self._written = there.keys
         self._waiting = self._take_up()
 
@@ -260,7 +261,7 @@ class LeRobotWriter:
         self._write_json(STATS, {n: {k: v.tolist() for k, v in found.items()} for n, found in stats.items()})
         total = self._total + len(ready)
         totals = {"total_episodes": total, "total_frames": frames, "total_tasks": len(tasks)}
-        info = self._info | totals | {"splits": {"train": f"0:{total}"}}
+        info: dict[str, Any] = {**self._info, **totals, "splits": {"train": f"0:{total}"}}
         self._write_json(INFO, info)
         self._info, self._tasks, self._stats, self._files = info, tasks, stats, self._files + 1
         self._written = (*self._written, *(each.key for each in ready))

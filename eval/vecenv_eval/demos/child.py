@@ -91,7 +91,7 @@ def answer(line: bytes) -> bytes:
     try:
         return pack(_REQUESTS[request["what"]](path, request, arrays), arrays)
     except AssetsMissing as error:
-        return pack({"error": str(error), "kind": "AssetsMissing"}, [])
+        return pack({"missing": [error.name, error.problem, error.how_to_get]}, [])
     except DemoError as error:
         return pack({"error": str(error).replace(str(path), shown, 1)}, [])
     except DAMAGE as error:
@@ -103,6 +103,8 @@ def main() -> None:
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is no answer
     _limit()
+    output.write(pack({"ready": True}, []))
+    output.flush()
     for line in sys.stdin.buffer:
         seconds = json.loads(line)["seconds"]
         if hasattr(signal, "alarm"):

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import h5py
 import numpy as np
+from h5py import h5o
 
 from vecenv.assets import AssetsMissing
 from vecenv.errors import InvalidInput
@@ -103,7 +104,7 @@ def member(group: h5py.Group, name: str, kind: type[Kind]) -> Kind:
     member = group[name]
     if not isinstance(member, kind):
         raise DemoError(f"{name!r} is not a {what}")
-    if (count := h5py.h5o.get_info(member.id).rc) != 1:
+    if (count := h5o.get_info(member.id).rc) != 1:
         raise DemoError(f"{name!r} has {count} links to it, which no {what} of a demonstration has")
     return member
 

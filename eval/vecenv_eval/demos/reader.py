@@ -27,11 +27,10 @@ import numpy as np
 from vecenv.assets import AssetsMissing
 from vecenv_eval.demos.hdf5 import DemoError
 
-# Seconds for one request, and for the start of the process.
-DEADLINE_S = 60.0
+# Seconds for one request, and for the start of the process, whose imports may come over a slow network.
+DEADLINE_S, START_S = 60.0, 300.0
 # Bytes of an answer.
 _MOST_BYTES = 1 << 30
-_KINDS = {"AssetsMissing": AssetsMissing}
 
 
 @dataclass(frozen=True)
@@ -69,12 +68,12 @@ class Reader:
         """
         limit = DEADLINE_S if deadline_s is None else deadline_s
         with self._lock:
-            until = time.monotonic() + limit
             request = {"what": what, "path": str(path.absolute()), "shown": str(path), "seconds": math.ceil(limit) + 5}
             try:
-                process = self._start()
+                process = self._start(path)
                 assert process.stdin is not None
                 assert process.stdout is not None
+                until = time.monotonic() + limit
                 process.stdin.write(json.dumps(request | arguments).encode() + b"\n")
                 process.stdin.flush()
                 answer = _receive(process.stdout, until)
@@ -86,8 +85,10 @@ class Reader:
             except BaseException:  # Ctrl-C: what the process would still answer belongs to nobody
                 self._kill()
                 raise
+        if (missing := answer.content.get("missing")) is not None:
+            raise AssetsMissing(*missing)
         if (error := answer.content.get("error")) is not None:
-            raise _KINDS.get(answer.content.get("kind", ""), DemoError)(error)
+            raise DemoError(error)
         return answer
 
     def close(self) -> None:
@@ -95,7 +96,12 @@ class Reader:
         with self._lock:
             self._kill()
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self, path: Path) -> subprocess.Popen[bytes]:
+        """The process, ready for a request.
+
+        Raises:
+            DemoError: it cannot be started, which is not the file's fault.
+        """
         if self._process is None or self._process.poll() is not None:
             environment = {
                 **os.environ,
@@ -110,6 +116,13 @@ class Reader:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
             )
+            assert self._process.stdout is not None
+            try:
+                _receive(self._process.stdout, time.monotonic() + START_S)
+            except (TimeoutError, EOFError, ValueError):
+                raise DemoError(
+                    f"{path}: the process that reads HDF5 files does not start (exit status {self._kill()})"
+                ) from None
         return self._process
 
     def _kill(self) -> int:

@@ -192,8 +192,9 @@ def _storable(value: Any, levels: int = _MOST_LEVELS) -> Any:
         if isinstance(value, Mapping):
             return {_storable(str(name)): _storable(each, levels - 1) for name, each in value.items()}
         return [_storable(each, levels - 1) for each in value]
-    if hasattr(value, "tolist") and levels:  # NumPy's numbers and arrays
-        return _storable(value.tolist(), levels - 1)
+    to_list = getattr(value, "tolist", None)  # of NumPy's numbers and arrays
+    if callable(to_list) and levels:
+        return _storable(to_list(), levels - 1)
     return _text(value)
 
 
