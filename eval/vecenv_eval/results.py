@@ -18,7 +18,7 @@ from vecenv_eval.episodes import Episode, Suite
 from vecenv_eval.policies import BUILTIN
 from vecenv_eval.report import Summary, markdown, summarise
 from vecenv_eval.store import CONFIG, Record, ResultStore, StoreError
-from vecenv_eval.store.files import read_json
+from vecenv_eval.store.files import parse_json, read_json
 
 # Where ``config.json`` has the policy's name, which is known where the policy is made.
 POLICY_NAME = "policy_name"
@@ -265,7 +265,7 @@ def _as_text(value: object) -> str:
 
 def _plain(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments as ``config.json`` has them."""
-    return json.loads(json.dumps(dict(arguments), default=str))
+    return parse_json(json.dumps(dict(arguments), default=str).encode())
 
 
 def write_results(

@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from vecenv.errors import InvalidFile
+from vecenv_eval.datasets import waiting
 from vecenv_eval.datasets.statistics import Statistics, together
 from vecenv_eval.datasets.waiting import DAMAGE, PARTIAL, PENDING, DatasetError
 from vecenv_eval.episodes import Episode
@@ -87,14 +86,10 @@ def _read(root: Path) -> Contents:
     info = read_json(root / INFO)
     if info["codebase_version"] != VERSION:
         raise DatasetError(f"{root} is a LeRobot dataset of format {info['codebase_version']!s:.50}, not {VERSION}")
-    for name in ("total_episodes", "total_frames", "fps"):
+    waiting.checked_info(info)
+    for name in ("total_episodes", "total_frames"):
         if type(info[name]) is not int or info[name] < 0:
             raise DatasetError(f"{root / INFO}: {name} is {info[name]!r:.50}, not a whole number from 0")
-    features = info["features"]
-    if not isinstance(features, dict) or not all(isinstance(f, dict) and "dtype" in f for f in features.values()):
-        raise DatasetError(f"{root / INFO}: features are no mapping of names to their dtype and shape")
-    if not isinstance(info["robot_type"], str):
-        raise DatasetError(f"{root / INFO}: robot_type is {info['robot_type']!r:.50}, not text")
     total = info["total_episodes"]
     rows = [row for path in sorted(root.glob("meta/episodes/*/*.parquet")) for row in table(path).to_pylist()]
     rows = sorted((row for row in rows if row["episode_index"] < total), key=lambda row: row["episode_index"])
@@ -104,7 +99,7 @@ def _read(root: Path) -> Contents:
         raise DatasetError(f"{root}: {INFO} counts {info['total_frames']} frames, meta/episodes has others")
     places = [row["data/chunk_index"] * CHUNK + row["data/file_index"] for row in rows]
     for row in rows:
-        key_of(row)
+        waiting.checked_about(row)
     tasks = table(root / TASKS).to_pydict()
     found = Contents(
         info=info,
@@ -112,8 +107,8 @@ def _read(root: Path) -> Contents:
         rows=tuple(rows),
         files=1 + max(places, default=-1),
     )
-    stats = {name: {k: np.array(v) for k, v in each.items()} for name, each in read_json(root / STATS).items()}
-    if [int(each["count"][0]) for name, each in stats.items() if name == "index"] != [info["total_frames"]]:
+    stats = {name: waiting.statistics(each) for name, each in read_json(root / STATS).items()}
+    if set(stats) != set(info["features"]) or int(stats["index"]["count"][0]) != info["total_frames"]:
         stats = _together(rows)  # a process was killed between the two
     return Contents(info=info, tasks=found.tasks, stats=stats, rows=found.rows, files=found.files)
 
@@ -126,13 +121,13 @@ def _together(rows: list[dict[str, Any]]) -> dict[str, Statistics]:
 
 def statistics_of(row: Mapping[str, Any]) -> dict[str, Statistics]:
     """The statistics of an episode by feature, from its row of ``meta/episodes``."""
-    found: dict[str, Statistics] = {}
+    found: dict[str, dict[str, Any]] = {}
     for name, value in row.items():
         start, _, rest = name.partition("/")
         if start == "stats":
             feature, _, which = rest.rpartition("/")
-            found.setdefault(feature, {})[which] = np.array(value)
-    return found
+            found.setdefault(feature, {})[which] = value
+    return {feature: waiting.statistics(values) for feature, values in found.items()}
 
 
 def table(path: Path) -> Any:
@@ -143,7 +138,7 @@ def table(path: Path) -> Any:
     """
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(path) as file:
+    with pq.ParquetFile(path, page_checksum_verification=True) as file:
         about = file.metadata
         size = sum(about.row_group(index).total_byte_size for index in range(about.num_row_groups))
         if not 0 <= size <= _MOST_BYTES:

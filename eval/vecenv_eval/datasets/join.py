@@ -6,7 +6,6 @@ and what depends on them is counted anew.
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -22,11 +21,8 @@ from vecenv_eval.datasets.waiting import DAMAGE, PARTIAL, DatasetError, Waiting
 from vecenv_eval.episodes import Episode
 
 _ABOUT = ("tasks", "success", "suite", "task_id", "source_episode")
-_INDICES = ("episode_index", "index", "task_index")
 # A writer may be moving episodes into the dataset's files while they are read: how often to look again.
 _LOOKS = 5
-# Names of features, which become names of files.
-_FEATURE = re.compile(r"[\w.-]{1,200}")
 
 
 def copy_episodes(source: Path, target: Path, episodes: Collection[Episode]) -> int:
@@ -120,12 +116,8 @@ class _Joiner(LeRobotWriter):
         self._info.setdefault("fps", info["fps"])
         if info["fps"] != self._info["fps"]:
             raise DatasetError(f"{source}: {info['fps']} ticks a second, in {self.root} {self._info['fps']}")
-        cameras = [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
-        for name in cameras:
-            if not _FEATURE.fullmatch(name):
-                raise DatasetError(f"{source}: feature {name!r:.100} is no name of a camera")
         self._check_features(dict(info["features"]), key, info["robot_type"])
-        return cameras
+        return waiting.cameras_of(info)
 
     def _copied(self, video: Path, camera: str) -> Path:
         """A copy of an episode's video, ready to be moved to its place."""
@@ -141,15 +133,7 @@ def _frames(source: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> di
     table = table.filter(waiting.array_of(table, "episode_index") == row["episode_index"])
     if table.num_rows != row["length"]:
         raise DatasetError(f"{source}: episode {row['episode_index']} has {table.num_rows} frames, not {row['length']}")
-    found = {}
-    for name in table.column_names:
-        if name not in _INDICES:
-            array = waiting.array_of(table, name)
-            dtype = info["features"][name]["dtype"]
-            if array.dtype != dtype:
-                raise DatasetError(f"{path}: {name} is {array.dtype}, {files.INFO} says {dtype!s:.50}")
-            found[name] = array
-    return found
+    return waiting.columns_of(table, info["features"])
 
 
 def _numbers(row: Mapping[str, Any], *names: str) -> list[int]:

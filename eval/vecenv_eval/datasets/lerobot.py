@@ -46,7 +46,6 @@ LIBERO_STATE_NAMES = ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle
 ROBOTS = {"simpler/bridge": "widowx", "simpler/google_robot": "google_robot"}
 # Episodes that wait before they are written to the dataset's files; ticks between images whose values are counted.
 FLUSH, COUNT_EVERY = 100, 4
-_SCALARS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
 
 
 def image_keys(cameras: Sequence[str] = ()) -> dict[str, str]:
@@ -140,6 +139,8 @@ class LeRobotWriter:
         found = list(kept.values())
         if found and "fps" not in self._info:
             self._info |= dict(found[0].info)
+        for each in found:
+            self._check_features(dict(each.info["features"]), each.key, each.info["robot_type"])
         return waiting.renumber(found, [], self._total)[0] if found else []
 
     def begin(self, env: Observable, episodes: Mapping[int, Episode]) -> None:
@@ -340,9 +341,7 @@ class LeRobotWriter:
             "dataset_to_index": start + ticks,
         }
         chunk, file = divmod(episode.number, CHUNK)
-        for key, feature in self._info["features"].items():
-            if feature["dtype"] != "video":
-                continue
+        for key in waiting.cameras_of(self._info):
             waiting.place(episode.video(key), self.root / VIDEO.format(chunk, file, key=key))
             row |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
             row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": ticks / self._info["fps"]}
@@ -381,7 +380,7 @@ def _features(rollout: _Rollout, fps: int) -> dict[str, dict[str, Any]]:
         info |= {"has_audio": False, "is_depth_map": False}
         shape = [video.height, video.width, 3]
         found[key] = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": info}
-    scalars = {"next.done": "bool", "next.success": "bool", **_SCALARS}
+    scalars = {"next.done": "bool", "next.success": "bool", **waiting.SCALARS}
     return found | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in scalars.items()}
 
 

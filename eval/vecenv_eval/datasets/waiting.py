@@ -21,15 +21,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vecenv.errors import InvalidFile
-from vecenv_eval.datasets.statistics import Statistics
+from vecenv_eval.datasets.statistics import QUANTILES, Statistics
 from vecenv_eval.episodes import Episode
-from vecenv_eval.store.files import replace_bytes, sync_folder
+from vecenv_eval.store.files import read_json, replace_bytes, sync_folder
+from vecenv_eval.store.record import MOST_EPISODES
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 PENDING, PARTIAL = ".pending", ".partial"
 _FRAMES, _ABOUT = "frames.parquet", "about.json"
+# Columns of frames that depend on what the dataset holds already, and the others with one number a frame.
+INDICES = ("episode_index", "index", "task_index")
+SCALARS = {"timestamp": "float32", **dict.fromkeys(("frame_index", *INDICES), "int64")}
+STATISTICS = ("min", "max", "mean", "std", "count", *QUANTILES)
+_DTYPES = ("float32", "bool", "int64", "video")
+# Far beyond any robot and camera.
+_MOST_FPS, _MOST_SIZE = 10_000, 100_000
+# Names of features become names of files.
+_FEATURE = re.compile(r"[\w.-]{1,200}")
 # What pyarrow, NumPy and json raise over files that are damaged or hold something else.
 DAMAGE = (
     OSError,
@@ -134,24 +144,106 @@ def load(folder: Path) -> Waiting:
     """
     import pyarrow.parquet as pq
 
-    from vecenv_eval.store.files import read_json
-
     try:
-        content, table = read_json(folder / _ABOUT), pq.read_table(folder / _FRAMES)
+        content, table = read_json(folder / _ABOUT), pq.read_table(folder / _FRAMES, page_checksum_verification=True)
+        about, info = dict(content["about"]), checked_info(content["info"])
+        checked_about(about)
+        images = {name: statistics(found) for name, found in dict(content["images"]).items()}
+        if set(images) != set(cameras_of(info)):
+            raise ValueError("it has images of other cameras than it says")
         return Waiting(
             folder=folder,
-            key=_key(content["about"]),
-            columns={name: array_of(table, name) for name in table.column_names},
-            images={
-                name: {k: np.array(v) for k, v in found.items()} for name, found in dict(content["images"]).items()
-            },
-            about=dict(content["about"]),
-            info=dict(content["info"]),
+            key=_key(about),
+            columns=columns_of(table, info["features"]),
+            images=images,
+            about=about,
+            info=info,
         )
     except FileNotFoundError:
         raise
     except (*DAMAGE, InvalidFile) as error:
         raise DatasetError(f"{folder} is damaged: {type(error).__name__}: {' '.join(str(error).split())}") from None
+
+
+def checked_info(info: Any) -> dict[str, Any]:
+    """What ``meta/info.json`` says, if it has the form of ours.
+
+    Raises:
+        ValueError: it has not.
+    """
+    if not isinstance(info, dict) or not isinstance(info.get("robot_type"), str):
+        raise ValueError("robot_type is no text")
+    if type(info.get("fps")) is not int or not 0 < info["fps"] <= _MOST_FPS:
+        raise ValueError(f"fps is {info.get('fps')!r:.50}, not a whole number from 1 to {_MOST_FPS}")
+    features = info.get("features")
+    if not isinstance(features, dict):
+        raise ValueError("features is no JSON object")
+    for name, feature in features.items():
+        shape = feature.get("shape") if isinstance(feature, dict) else None
+        sizes = isinstance(shape, list) and all(type(size) is int and 0 < size <= _MOST_SIZE for size in shape)
+        if not sizes or len(shape or ()) not in (1, 3) or feature.get("dtype") not in _DTYPES:
+            raise ValueError(f"feature {name!r:.50} has another dtype or shape than any of ours")
+        if not _FEATURE.fullmatch(name):
+            raise ValueError(f"{name!r:.50} is no name of a feature")
+    if missing := sorted({"observation.state", "action", *SCALARS} - features.keys()):
+        raise ValueError(f"there is no feature {missing[0]}")
+    return info
+
+
+def checked_about(row: Mapping[str, Any]) -> None:
+    """Refuse what ``meta/episodes`` tells about an episode if it has another form than ours.
+
+    Raises:
+        ValueError, KeyError: it has.
+    """
+    tasks = row["tasks"]
+    if not isinstance(tasks, list) or len(tasks) != 1 or not isinstance(tasks[0], str):
+        raise ValueError(f"tasks is {tasks!r:.50}, not one instruction")
+    if not isinstance(row["suite"], str) or not isinstance(row["success"], bool):
+        raise ValueError("suite is no text, or success not true or false")
+    for name in ("task_id", "source_episode"):
+        if type(row[name]) is not int or not 0 <= row[name] <= MOST_EPISODES:
+            raise ValueError(f"{name} is {row[name]!r:.50}, not a whole number from 0 to {MOST_EPISODES:,}")
+
+
+def statistics(values: Mapping[str, Any]) -> Statistics:
+    """Statistics of one feature, from JSON or parquet.
+
+    Raises:
+        ValueError, KeyError: they are none.
+    """
+    found = {name: np.array(values[name]) for name in STATISTICS}
+    shape = found["mean"].shape
+    for name, array in found.items():
+        if array.dtype.kind not in "iufb" or array.shape != ((1,) if name == "count" else shape) or array.size > 10_000:
+            raise ValueError(f"{name} holds no statistics")
+    if not found["count"][0] > 0:
+        raise ValueError("count is not above 0")
+    return found
+
+
+def cameras_of(info: Mapping[str, Any]) -> list[str]:
+    """The features that are videos."""
+    return [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
+
+
+def columns_of(table: pa.Table, features: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """An episode's frames by feature, [T, n] or [T], without the indices in the dataset.
+
+    Raises:
+        ValueError: they are not what the features say.
+    """
+    wanted = [name for name, feature in features.items() if feature["dtype"] != "video" and name not in INDICES]
+    if not set(wanted) <= set(table.column_names) <= {*wanted, *INDICES}:
+        raise ValueError("frames have other features than meta/info.json says")
+    found = {name: array_of(table, name) for name in wanted}
+    for name, array in found.items():
+        width = array.shape[1] if array.ndim == 2 else 1
+        if [width] != features[name]["shape"] or array.dtype != features[name]["dtype"]:
+            raise ValueError(f"{name} is {array.dtype} {array.shape}, meta/info.json says something else")
+    if not len(table):
+        raise ValueError("there is no frame")
+    return found
 
 
 def folders(root: Path) -> list[Path]:
@@ -215,7 +307,7 @@ def write_parquet(path: Path, tables: Iterable[pa.Table]) -> None:
 
     temporary = path.with_name(path.name + ".tmp")
     tables = list(tables)
-    with temporary.open("wb") as file, pq.ParquetWriter(file, tables[0].schema) as writer:
+    with temporary.open("wb") as file, pq.ParquetWriter(file, tables[0].schema, write_page_checksum=True) as writer:
         for table in tables:
             writer.write_table(table)
     sync(temporary)

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from vecenv_eval.store.record import LARGEST, StoreError
+from vecenv_eval.store.record import LARGEST, StoreError, unicode
 
 # Bytes of a JSON file, and levels of objects and lists in each other; ours have less than 1 MB and 10 levels.
 MOST_BYTES, MOST_LEVELS = 1 << 28, 64
@@ -36,7 +36,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def parse_json(text: bytes) -> Any:
-    """Plain values from JSON in UTF-8.
+    """Plain values from JSON in UTF-8; texts have a form in UTF-8, which JSON does not promise.
 
     Raises:
         ValueError: it is none, its levels are too deep, or it holds a number that is too large.
@@ -45,19 +45,20 @@ def parse_json(text: bytes) -> Any:
         value = json.loads(text.decode("utf-8"))
     except RecursionError:
         raise ValueError(f"more than {MOST_LEVELS} levels of JSON") from None
-    _check(value, MOST_LEVELS)
-    return value
+    return _checked(value, MOST_LEVELS)
 
 
-def _check(value: Any, levels: int) -> None:
-    """Refuse depth, and numbers that nothing else could store."""
+def _checked(value: Any, levels: int) -> Any:
+    """The value; depth is refused, and numbers that nothing else could store."""
     if levels < 0:
         raise ValueError(f"more than {MOST_LEVELS} levels of JSON")
-    if isinstance(value, dict | list):
-        for each in value.values() if isinstance(value, dict) else value:
-            _check(each, levels - 1)
-    elif isinstance(value, int) and abs(value) > LARGEST:
+    if isinstance(value, dict):
+        return {unicode(name): _checked(each, levels - 1) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_checked(each, levels - 1) for each in value]
+    if isinstance(value, int) and abs(value) > LARGEST:
         raise ValueError(f"a whole number has {len(str(abs(value)))} digits, more than can be stored")
+    return unicode(value) if isinstance(value, str) else value
 
 
 def append_text(path: Path, text: str) -> None:

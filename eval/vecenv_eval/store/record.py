@@ -183,7 +183,7 @@ def _storable(value: Any, levels: int = _MOST_LEVELS) -> Any:
     if value is None or isinstance(value, bool):
         return value
     if isinstance(value, str):
-        return value.encode("utf-8", "backslashreplace").decode()  # of surrogates, from file names for example
+        return unicode(value)
     if isinstance(value, int):
         return int(value) if abs(value) <= LARGEST else _text(value)
     if isinstance(value, float):
@@ -196,6 +196,11 @@ def _storable(value: Any, levels: int = _MOST_LEVELS) -> Any:
     if callable(to_list) and levels:
         return _storable(to_list(), levels - 1)
     return _text(value)
+
+
+def unicode(text: str) -> str:
+    """A text as UTF-8 can hold it: surrogates, which file names of other encodings may have, are written as escapes."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def _text(value: object) -> str:
