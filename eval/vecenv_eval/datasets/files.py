@@ -158,4 +158,7 @@ def open_to_write(root: Path) -> Contents:
             match = _PLACE.fullmatch("/".join(path.parts[-2:]))
             if match and int(match[1]) * CHUNK + int(match[2]) >= found.files:
                 path.unlink()
+    for part in ("data", "meta", "videos"):
+        for path in (root / part).rglob("*.tmp"):
+            path.unlink()
     return found

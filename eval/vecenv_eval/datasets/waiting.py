@@ -327,6 +327,8 @@ def sync(path: Path) -> None:
 def place(source: Path, target: Path) -> None:
     """Give a file a second name, which replaces what is there; a copy where the file system has no such links."""
     target.parent.mkdir(parents=True, exist_ok=True)
+    if target.exists() and target.samefile(source):  # a rename of one name to another of the same file does nothing
+        return
     temporary = target.with_name(target.name + ".tmp")
     temporary.unlink(missing_ok=True)
     try:

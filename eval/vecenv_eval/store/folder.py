@@ -25,6 +25,7 @@ from vecenv_eval.store.rows import JSONL, Rows, rows_in
 
 CONFIG, ERRORS, SUMMARY, REPORT = "config.json", "errors.log", "summary.json", "report.md"
 DEMOS = "demos"
+_LOGS = "policy_logs/*.tmp"
 # Where results folders go unless something else is asked for.
 RESULTS = Path("results")
 
@@ -131,6 +132,12 @@ class ResultStore:
     def log_error(self, text: str) -> None:
         """Add a traceback to ``errors.log``."""
         append_text(self.folder / ERRORS, text.rstrip() + "\n\n")
+
+    def tidy(self) -> None:
+        """Remove what a process that was killed left of files that it was replacing; for whoever is writing."""
+        for pattern in (f"{CONFIG}.tmp", f"{SUMMARY}.tmp", f"{REPORT}.tmp", f"{DEMOS}/*.tmp", f"{DEMOS}/*.new", _LOGS):
+            for path in self.folder.glob(pattern):
+                path.unlink(missing_ok=True)
 
     def discard(self) -> None:
         """Remove the folder if it holds no episode and nothing but what :meth:`create` puts there."""
