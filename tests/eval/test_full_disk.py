@@ -3,36 +3,28 @@
 from __future__ import annotations
 
 import os
+import resource
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from support import recorded_world as world
 from support.results_folders import some_records, write_results
 from typer.testing import CliRunner
+from vecenv_eval import runner
 from vecenv_eval.store import ResultStore
 
-from vecenv.cli import build_app
+from vecenv.cli import build_app, main
 
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
-# `vecenv eval` of the fake suite, where no file may grow beyond so many bytes.
-COMMAND = """
-import resource, sys
-from support.recorded_world import RecordedWorld
-from vecenv_eval import runner
-runner.vecenv_simulator = lambda: RecordedWorld().simulator
-limit = int(sys.argv[1])
-if limit:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-sys.argv = ["vecenv", "eval", *sys.argv[2:]]
-from vecenv.cli import main
-main()
-"""
 POLICY = f"{world.UnlikelyPolicy.__module__}:{world.UnlikelyPolicy.__name__}"
 SETTINGS = f"--suite {world.SUITE} --policy {POLICY} --tasks 0-1 --num-envs 3 --quiet"
 RECORDERS = {
@@ -43,18 +35,39 @@ RECORDERS = {
 }
 
 
-def evaluate(folder: Path, *options: str, limit: int = 0) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", COMMAND, str(limit), *SETTINGS.split(), "--out", str(folder), *options],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+@dataclass(frozen=True)
+class Done:
+    """How a command ended in a fork."""
+
+    returncode: int
+    stderr: str
 
 
-def check_refused(done: subprocess.CompletedProcess[str], folder: Path) -> None:
+def evaluate(folder: Path, *options: str, limit: int = 0) -> Done:
+    """``vecenv eval`` of the fake suite in a fork, where no file may grow beyond so many bytes."""
+    with tempfile.TemporaryFile() as said:
+        pid = os.fork()
+        if pid == 0:
+            status = 3
+            try:
+                os.dup2(said.fileno(), 2)
+                sys.stderr = os.fdopen(2, "w")
+                runner.vecenv_simulator = lambda: world.RecordedWorld().simulator
+                if limit:
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+                sys.argv = ["vecenv", "eval", *SETTINGS.split(), "--out", str(folder), *options]
+                main()
+            except SystemExit as exit:
+                status = exit.code if isinstance(exit.code, int) else 0
+            finally:
+                sys.stderr.flush()
+                os._exit(status)
+        _, ended = os.waitpid(pid, 0)
+        said.seek(0)
+        return Done(os.waitstatus_to_exitcode(ended), said.read().decode())
+
+
+def check_refused(done: Done, folder: Path) -> None:
     assert done.returncode == 2, (done.returncode, done.stderr)
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: ")
@@ -63,14 +76,14 @@ def check_refused(done: subprocess.CompletedProcess[str], folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("recorder", "limit"), [("states", 12_000), ("lerobot", 2_500), ("video", 1_000), ("all", 9_000)]
+    ("recorder", "limit"), [("states", 30_000), ("lerobot", 4_000), ("video", 4_000), ("all", 30_000)]
 )
 def test_a_file_that_cannot_grow_costs_no_verdict_and_no_recording(tmp_path: Path, recorder: str, limit: int) -> None:
     folder, options = tmp_path / "run", RECORDERS[recorder]
     done = evaluate(folder, *options, limit=limit)
     check_refused(done, folder)
     kept = world.verdicts(folder)
-    assert len(kept) < 10
+    assert len(kept) < 10 or recorder == "lerobot"  # whose files are written after the last verdict
     check_recorded(folder, recorder, everything=False)
     assert evaluate(folder, *options).returncode == 0
     assert len(world.verdicts(folder)) == 10
@@ -131,13 +144,12 @@ def test_a_full_disk(tmp_path: Path, store: str) -> None:
 @pytest.mark.parametrize("store", ["jsonl", "sqlite"])
 def test_a_folder_that_may_only_be_read_can_be_read(tmp_path: Path, store: str) -> None:
     """Also one whose process was killed, which left a log beside its database."""
+    made = tmp_path / "made"
+    config = {"suite": "libero_goal", "policy": "zero", "store": store}
+    store_of = write_results(made, some_records(lambda task, episode: True), config=config)
     with small_disk(tmp_path / "disk", "4m") as remount:
         folder = tmp_path / "disk" / "run"
-        write_results(
-            folder,
-            some_records(lambda task, episode: True),
-            config={"suite": "libero_goal", "policy": "zero", "store": store},
-        )
+        shutil.copytree(store_of, folder, ignore=shutil.ignore_patterns("*-shm"))
         before = ResultStore(folder).records()
         remount("ro")
         assert ResultStore.open(folder).records() == before

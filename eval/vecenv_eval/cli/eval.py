@@ -262,11 +262,17 @@ def _disk_errors(folder: Path) -> Iterator[None]:
         there = any((folder / name).is_file() for name in (CONFIG, CAMPAIGN))
         again = f" What was computed is kept; to go on: {resume_command(folder)}" if there else ""
         what = (
-            f"the results in {folder} cannot be written: {error.strerror or error}"
+            f"the results in {folder} cannot be written: {error.strerror or error}{_which(error, folder)}"
             if isinstance(error, OSError)
             else error
         )
         raise _RunError(f"{what}.{again}", 2) from error
+
+
+def _which(error: OSError, folder: Path) -> str:
+    """The file that an error is about, if it is in the folder."""
+    name = error.filename if isinstance(error.filename, str) else ""
+    return f" ({Path(name).relative_to(folder)})" if name and Path(name).is_relative_to(folder / "") else ""
 
 
 @contextmanager

@@ -23,7 +23,7 @@ import numpy as np
 from vecenv.errors import InvalidFile
 from vecenv_eval.datasets.statistics import QUANTILES, Statistics
 from vecenv_eval.episodes import Episode
-from vecenv_eval.store.files import read_json, replace_bytes, sync_folder
+from vecenv_eval.store.files import naming, read_json, replace_bytes, sync_folder
 from vecenv_eval.store.record import MOST_EPISODES
 
 if TYPE_CHECKING:
@@ -307,7 +307,11 @@ def write_parquet(path: Path, tables: Iterable[pa.Table]) -> None:
 
     temporary = path.with_name(path.name + ".tmp")
     tables = list(tables)
-    with temporary.open("wb") as file, pq.ParquetWriter(file, tables[0].schema, write_page_checksum=True) as writer:
+    with (
+        naming(path),
+        temporary.open("wb") as file,
+        pq.ParquetWriter(file, tables[0].schema, write_page_checksum=True) as writer,
+    ):
         for table in tables:
             writer.write_table(table)
     sync(temporary)
