@@ -17,6 +17,7 @@ from vecenv.errors import VecenvError
 EXCEPTIONS = {
     "_ContextLost": "raised and caught in vecenv.libero.render.gl, which then makes a new GL context",
     "_Stopped": "raised and caught in vecenv_eval.engines.ray_actor, where it ends the episode loop",
+    "Terminated": "SIGTERM, which vecenv_eval.cli raises and catches as Python does with KeyboardInterrupt",
     "ConnectionLost": "raised and caught in vecenv_eval.clients.zmq, which retries and then raises PolicyServerError",
 }
 

@@ -78,7 +78,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A LeRobot dataset of two episodes, and a third one that waits."""
     lerobot = pytest.importorskip("vecenv_eval.datasets.lerobot")
     root = tmp_path_factory.mktemp("fuzz") / "set"
-    env, done = FilmedEnv(), []
+    env: Any = FilmedEnv()
+    done: list[Any] = []
     writer = lerobot.LeRobotWriter(root, verdicts=lambda: done)
     for number in range(3):
         outcome = filmed_record(number)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import h5py
 import numpy as np
-from h5py import h5o
+from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]
 
 from vecenv.assets import AssetsMissing
 from vecenv.errors import InvalidInput

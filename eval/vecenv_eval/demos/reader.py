@@ -51,6 +51,7 @@ class Reader:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
+        self._owner = os.getpid()
         self._lock = threading.Lock()
 
     def ask(self, path: Path, what: str, deadline_s: float | None = None, **arguments: Any) -> Answer:
@@ -102,6 +103,8 @@ class Reader:
         Raises:
             DemoError: it cannot be started, which is not the file's fault.
         """
+        if self._owner != os.getpid():  # a fork's answers would mix with its parent's
+            self._owner, self._process = os.getpid(), None
         if self._process is None or self._process.poll() is not None:
             environment = {
                 **os.environ,
@@ -128,7 +131,7 @@ class Reader:
     def _kill(self) -> int:
         """End the process; gives its exit status."""
         process, self._process = self._process, None
-        if process is None:
+        if process is None or self._owner != os.getpid():
             return 0
         try:
             status = process.wait(0.5)  # one that crashed is about to say how

@@ -187,7 +187,7 @@ def _stored_rows(folder: Path) -> dict[int, Mapping[str, Any]] | None:
     """The rows of ``summary.json`` by task, for which episodes were planned; None where they cannot be read."""
     counts = ("episodes", "errors", "missing")
     try:
-        found = {
+        found: dict[int, Mapping[str, Any]] = {
             row["task"]: {"instruction": str(row["instruction"]), **{name: row[name] for name in counts}}
             for row in read_json(folder / SUMMARY)["tasks"]
         }
