@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -418,3 +419,39 @@ def test_what_a_policy_reports_is_kept_with_the_episode(store: ResultStore) -> N
     older = (store.folder / "episodes.jsonl").read_text().replace('"extras"', '"unknown"')
     (store.folder / "episodes.jsonl").write_text(older)
     assert store.records()[Episode("s", 0, 0)].extras == {}
+
+
+def test_a_reader_that_takes_long_costs_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sqlite, "file_system", lambda folder: "nfs4")  # without the log, readers and writer exclude
+    monkeypatch.setattr(sqlite, "_WRITER_S", 0.05)
+    store = create(tmp_path / "run", "sqlite")
+    store.append([record()])
+    with closing(sqlite3.connect(store.rows.path, check_same_thread=False)) as reader:
+        rows = reader.execute("SELECT * FROM episodes")
+        timer = threading.Timer(0.5, rows.fetchall)
+        timer.start()
+        store.append([record(0, 1)])
+        timer.join()
+    assert "another process holds the database; waiting to write" in caplog.text
+    assert len(store.records()) == 2
+
+
+def test_whatever_a_policy_reports_can_be_read_again(either: ResultStore) -> None:
+    deep: list[Any] = []
+    for _ in range(500):
+        deep = [deep]
+    said = {
+        "array": np.arange(3),
+        "number": np.float32(0.5),
+        "large": 10**5000,
+        "path": "a\udc80b",
+        7: {1, 2},
+        "deep": deep,
+    }
+    either.append([record(extras=said, fault="\ud800", wall_s=np.float64(2.0))])
+    (found,) = ResultStore.open(either.folder).records().values()
+    assert (found.extras["array"], found.extras["number"]) == ([0, 1, 2], 0.5)
+    assert (found.extras["path"], found.extras["7"], found.fault) == ("a\\udc80b", "{1, 2}", "\\ud800")
+    json.dumps(found.verdict, allow_nan=False).encode()

@@ -119,7 +119,7 @@ class Record:
 
 def to_plain(record: Record) -> dict[str, Any]:
     """A record as JSON has it: no NaN or infinity, which become null, and no text without a form in UTF-8."""
-    return _storable(asdict(record))
+    return {each.name: _storable(getattr(record, each.name)) for each in fields(record)}
 
 
 def from_plain(values: object) -> Record:
