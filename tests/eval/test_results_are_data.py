@@ -36,9 +36,7 @@ class P:
         return np.zeros((self.n, 7))
 def annotated(seed: int = 0) -> P: return P(seed)
 def anything(weights): Path("called").touch()
-POLICY = P()
-Path("imported").unlink(); Path("made").unlink()
-Path("imported").touch()
+POLICY = P.__new__(P)
 """
 
 
