@@ -18,11 +18,11 @@ from typing import Any
 from vecenv.util.tables import Column, FittedTable
 from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.engine import engine_class
-from vecenv_eval.results import CAMPAIGN, EvalResult, Progress, open_or_begin, refuse_other_settings
+from vecenv_eval.results import CAMPAIGN, EvalResult, Progress, changed, open_or_begin, refuse_other_settings
 from vecenv_eval.runner import Evaluation, check
 from vecenv_eval.simulator import Simulator, vecenv_simulator
 from vecenv_eval.store import REPORT, SUMMARY, ResultStore, StoreError
-from vecenv_eval.store.files import replace_text
+from vecenv_eval.store.files import read_json, replace_text
 
 _OVER_SEEDS = "Success: mean and sample standard deviation over seeds."
 
@@ -135,13 +135,19 @@ class Campaign:
             self.num_episodes.append(sum(map(len, episodes.values())))
 
     @classmethod
-    def open(cls, folder: Path, simulator: Simulator | None = None) -> Campaign:
+    def open(cls, folder: Path, simulator: Simulator | None = None, **changes: Any) -> Campaign:
         """A campaign that is continued.
 
+        Args:
+            folder: its folder.
+            simulator: where environments come from, ``vecenv`` when not given.
+            **changes: as for ``vecenv_eval.results.resume``.
+
         Raises:
+            ConfigError: something has to be given again, or is not what the folder has.
             StoreError: the folder holds none.
         """
-        return cls(read_campaign(folder), folder, simulator)
+        return cls(changed(read_campaign(folder), changes, folder), folder, simulator)
 
     def run(
         self,
@@ -188,7 +194,9 @@ def read_campaign(folder: Path) -> EvalConfig:
         StoreError: the folder holds none.
     """
     try:
-        return EvalConfig.from_dict(json.loads((folder / CAMPAIGN).read_text()))
+        return EvalConfig.from_dict(read_json(folder / CAMPAIGN))
+    except StoreError:
+        raise
     except (OSError, ValueError, TypeError) as error:
         raise StoreError(f"{folder / CAMPAIGN} cannot be read: {error}") from None
 

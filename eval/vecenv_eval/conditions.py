@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vecenv import family, protocols
 from vecenv_eval.config import STORE_CHOICES
+from vecenv_eval.store import StoreError
 
 if TYPE_CHECKING:
     from vecenv.contract import BatchEnv
@@ -21,6 +23,10 @@ if TYPE_CHECKING:
 NONE = "-"
 # Conditions that no verdict depends on.
 INDIFFERENT = ("shard", "store")
+# What `describe` reads.
+_EVERY = frozenset(
+    {"protocol", "instead", "horizon", "idle_steps", "start", "contacts", "colors", "fixtures", "seed", "success"}
+)
 
 
 def conditions(env: BatchEnv, config: EvalConfig) -> dict[str, Any]:
@@ -80,6 +86,35 @@ def _simpler(env: BatchEnv, chosen: protocols.Protocol, used: Mapping[str, Any])
         "seed": "2022 to 2071" if chosen.name == protocols.DEFAULT else "the published lists'",
         "success": used["success"],
     }
+
+
+def checked_content(content: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
+    """The content of ``config.json``, in which everything but the settings has the form that readers expect.
+
+    Raises:
+        StoreError: something has not; the message names the file and the key.
+    """
+    runs, conditions, name = content.get("runs", []), content.get("conditions", {}), content.get("policy_name", "")
+    if not isinstance(runs, list) or not all(isinstance(run, dict) for run in runs):
+        raise StoreError(f"{path}: runs is no list of JSON objects")
+    if not isinstance(name, str):
+        raise StoreError(f"{path}: policy_name is {name!r:.50}, not text")
+    if not isinstance(conditions, dict):
+        raise StoreError(f"{path}: conditions is {conditions!r:.50}, not a JSON object")
+    if not conditions:
+        return content
+    if missing := sorted(_EVERY - conditions.keys()):
+        raise StoreError(f"{path}: conditions has no {', '.join(missing)}")
+    instead = conditions["instead"]
+    pairs = isinstance(instead, dict) and all(isinstance(pair, list) and len(pair) == 2 for pair in instead.values())
+    if not pairs:
+        raise StoreError(f"{path}: conditions: instead is {instead!r:.50}, not pairs by name")
+    for key, value in conditions.items():
+        if key != "instead" and not isinstance(value, str | int | float | bool | dict | None):
+            raise StoreError(f"{path}: conditions: {key} is {value!r:.50}, not a number or text")
+    if not isinstance(conditions["protocol"], str):
+        raise StoreError(f"{path}: conditions: protocol is {conditions['protocol']!r:.50}, not text")
+    return content
 
 
 def describe(conditions: Mapping[str, Any]) -> str:

@@ -31,6 +31,8 @@ NO_TRACKER = "none"
 # Policies that know a benchmark's scenes, by the family of suites they are made for.
 SCRIPTED = {"libero": "pick_place", "simpler": "simpler_scripted"}
 _KEY = "setting"
+# Of a file of settings: bytes, and values when its aliases are written out.
+_MOST_BYTES, _MOST_VALUES = 1 << 24, 200_000
 _Settings = TypeVar("_Settings", bound="DataclassInstance")
 
 
@@ -362,9 +364,28 @@ def read_settings(path: Path) -> dict[str, Any]:
     import yaml
 
     try:
-        values = yaml.safe_load(path.read_text())
+        if path.stat().st_size > _MOST_BYTES:
+            raise ConfigError(f"{path} cannot be read: it has more than {_MOST_BYTES:,} bytes")
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except ConfigError:
+        raise
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: bytes, dates that are none
         raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected settings such as `suite: libero_object`, one a line")
+    if not _is_small(values):
+        raise ConfigError(
+            f"{path} cannot be read: with its aliases written out it has more than {_MOST_VALUES:,} values"
+        )
     return values
+
+
+def _is_small(values: object) -> bool:
+    """Whether values that may share parts, or hold themselves, have few parts when each is written out."""
+    waiting, count = [values], 0
+    while waiting and count <= _MOST_VALUES:
+        each = waiting.pop()
+        inner = [*each.keys(), *each.values()] if isinstance(each, dict) else each if isinstance(each, list) else ()
+        count += 1 + len(inner)
+        waiting += inner
+    return count <= _MOST_VALUES

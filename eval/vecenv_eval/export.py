@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from vecenv.errors import InvalidInput, MissingDependency
-from vecenv_eval.results import resume
+from vecenv_eval.results import read_folder
 from vecenv_eval.store import CONFIG, StoreError
 from vecenv_eval.store.record import to_plain
 from vecenv_eval.store.sqlite import COLUMNS, sqlite_values
@@ -74,7 +74,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     """
     rows = []
     for each in results_folders(folder):
-        config, store = resume(each)
+        config, store = read_folder(each)
         about = {"policy": config.policy_name, "protocol": config.protocol, "seed": config.seed}
         rows += [about | to_plain(record) for record in store.records().values()]
     rows.sort(key=lambda row: (row["suite"], row["seed"] is not None, row["seed"], row["task"], row["episode"]))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from typing import Any
 
@@ -158,11 +159,12 @@ class EpisodeLoop:
                 return
 
     def close(self) -> None:
-        """Close the environment, if it is the loop's own, and whatever watches it."""
-        if self._owns_environments:
-            self._environments.close()
-        for recorder in self._recorders:
-            recorder.close()
+        """Close the environment, if it is the loop's own, and whatever watches it, all of them even if one raises."""
+        with ExitStack() as stack:
+            for recorder in reversed(self._recorders):
+                stack.callback(recorder.close)
+            if self._owns_environments:
+                stack.callback(self._environments.close)
 
     def _run_all(self, queue: deque[Stream]) -> bool:
         """Run streams until none is left; False when to stop for good."""

@@ -158,6 +158,7 @@ class Evaluation:
             _log.warning("policy %r could not be closed: %s", self.policy.name, raised(error))
 
     def _run(self, store: ResultStore, on_progress: Callable[[Progress], None]) -> EvalResult:
+        store.tidy()
         content = store.config()
         runs = content.get("runs", [])
         name = {POLICY_NAME: self.policy.name} if self._engine.in_process else {}

@@ -13,7 +13,7 @@ from vecenv_eval.conditions import stored_as
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.episodes import Episode
 from vecenv_eval.live import write_frame
-from vecenv_eval.store import Record, ResultStore
+from vecenv_eval.store import Record, ResultStore, StoreWriteError
 
 if TYPE_CHECKING:
     from vecenv_eval.demos.schema import Recording
@@ -77,10 +77,21 @@ class FolderSink:
         self._store.append(records)
 
     def add_demos(self, suite: str, task: int, instruction: str, recordings: Sequence[Recording]) -> None:
-        """Add recorded episodes to the task's HDF5 file."""
+        """Add recorded episodes to the task's HDF5 file; returns when they are on the disk.
+
+        Raises:
+            StoreWriteError: they cannot be written, or what is there is damaged.
+        """
+        from vecenv_eval.demos.hdf5 import DemoError
         from vecenv_eval.demos.write import write_demos
 
-        write_demos(self._store.demos_path(suite, task), suite, task, instruction, recordings)
+        path = self._store.demos_path(suite, task)
+        try:
+            write_demos(path, suite, task, instruction, recordings)
+        except DemoError as error:
+            raise StoreWriteError(f"recordings cannot be added: {error}; move the file away") from error
+        except OSError as error:
+            raise StoreWriteError(f"{path} cannot be written: {error.strerror}") from error
 
     def log_error(self, text: str) -> None:
         """Add a traceback to ``errors.log``."""

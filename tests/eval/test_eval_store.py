@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -151,7 +152,7 @@ def test_a_closed_database_is_one_file_that_reading_leaves_alone(tmp_path: Path)
     store.append([record()])
     store.close()
     assert len(ResultStore.open(store.folder).records()) == 1
-    assert {path.name for path in store.folder.iterdir()} == {"config.json", "episodes.sqlite"}
+    assert {path.name for path in store.folder.iterdir()} == {".lock", "config.json", "episodes.sqlite"}
     store.append([record(0, 1)])  # it opens again
     assert len(store.records()) == 2
 
@@ -322,7 +323,7 @@ def test_a_reward_that_is_not_finite_is_written_as_null(store: ResultStore) -> N
     assert store.records()[Episode("s", 0, 0)].reward is None
 
 
-@given(cut=st.integers(1, 60))
+@given(cut=st.integers(2, 60))
 def test_a_cut_off_last_line_costs_that_episode_only(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
     store = ResultStore.create(tmp_path_factory.mktemp("results") / "run", {})
     store.append([record(0, 0), record(0, 1)])
@@ -332,6 +333,16 @@ def test_a_cut_off_last_line_costs_that_episode_only(tmp_path_factory: pytest.Te
     reopened = ResultStore.open(store.folder)
     reopened.append([record(0, 2)])
     assert list(reopened.records()) == [Episode("s", 0, 0), Episode("s", 0, 2)]
+
+
+def test_a_row_of_which_only_the_newline_was_cut_off_is_kept(store: ResultStore) -> None:
+    store.append([record(0, 0), record(0, 1)])
+    path = store.folder / "episodes.jsonl"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert len(store.records()) == 2
+    reopened = ResultStore.open(store.folder)
+    reopened.append([record(0, 2)])
+    assert len(reopened.records()) == 3
 
 
 def test_a_damaged_line_further_up_is_named(store: ResultStore) -> None:
@@ -408,3 +419,39 @@ def test_what_a_policy_reports_is_kept_with_the_episode(store: ResultStore) -> N
     older = (store.folder / "episodes.jsonl").read_text().replace('"extras"', '"unknown"')
     (store.folder / "episodes.jsonl").write_text(older)
     assert store.records()[Episode("s", 0, 0)].extras == {}
+
+
+def test_a_reader_that_takes_long_costs_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sqlite, "file_system", lambda folder: "nfs4")  # without the log, readers and writer exclude
+    monkeypatch.setattr(sqlite, "_WRITER_S", 0.05)
+    store = create(tmp_path / "run", "sqlite")
+    store.append([record()])
+    with closing(sqlite3.connect(store.rows.path, check_same_thread=False)) as reader:
+        rows = reader.execute("SELECT * FROM episodes")
+        timer = threading.Timer(0.5, rows.fetchall)
+        timer.start()
+        store.append([record(0, 1)])
+        timer.join()
+    assert "another process holds the database; waiting to write" in caplog.text
+    assert len(store.records()) == 2
+
+
+def test_whatever_a_policy_reports_can_be_read_again(either: ResultStore) -> None:
+    deep: list[Any] = []
+    for _ in range(500):
+        deep = [deep]
+    said = {
+        "array": np.arange(3),
+        "number": np.float32(0.5),
+        "large": 10**5000,
+        "path": "a\udc80b",
+        7: {1, 2},
+        "deep": deep,
+    }
+    either.append([record(extras=said, fault="\ud800", wall_s=np.float64(2.0))])
+    (found,) = ResultStore.open(either.folder).records().values()
+    assert (found.extras["array"], found.extras["number"]) == ([0, 1, 2], 0.5)
+    assert (found.extras["path"], found.extras["7"], found.fault) == ("a\\udc80b", "{1, 2}", "\\ud800")
+    json.dumps(found.verdict, allow_nan=False).encode()

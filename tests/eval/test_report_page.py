@@ -253,16 +253,16 @@ def damage(folder: Path, file: str, content: str | bytes | None) -> Path:
         ("config.json", "[]", "cannot be read: it holds no JSON object"),
         ("config.json", b"\xff\xfe\x00", "cannot be read"),
         ("episodes.jsonl", "nonsense\n", "is not an episode"),
-        ("episodes.jsonl", b"\xff\n", "cannot be read"),
+        ("episodes.jsonl", b"\xff\n", "episodes.jsonl:1 is not an episode: byte 1 is not UTF-8"),
         (
             "episodes.jsonl",
             LINE.replace('"task": 0', '"task": "x"'),
-            "not a whole number",
+            "episodes.jsonl:1 is not an episode: task is 'x', not a whole number from 0",
         ),
         (
             "episodes.jsonl",
             LINE.replace('"num_steps": 1', '"num_steps": -1'),
-            "cannot be",
+            "num_steps is -1, not a whole number from 0",
         ),
     ],
 )

@@ -218,7 +218,7 @@ def test_parts_that_are_none_are_refused_in_a_report(solved: Path, tmp_path: Pat
     for name in ("config.json", "episodes.jsonl"):
         text = (solved / name).read_text()
         (tmp_path / name).write_text(text.replace('"parts": {', '"parts": {"is_new": "yes", '))
-    with pytest.raises(StoreError, match=r"parts of episode simpler/bridge/1/\d is .*, not names and numbers"):
+    with pytest.raises(StoreError, match=r"episodes.jsonl:\d is not an episode: parts is .*, not names and numbers"):
         read_run(tmp_path)
 
 

@@ -62,12 +62,13 @@ def assert_one_sentence(done: Result, *words: str, status: int = 2) -> None:
 
 # Policies.
 
+VERBS = "    def reset(self, env, info): ...\n    def act(self, env): ...\n"
 BAD_POLICIES = {
     "raises": (
-        "class P:\n    name = 'p'\n    def __init__(self):\n        raise OSError('no weights in /models')\n",
+        "class P:\n    name = 'p'\n    def __init__(self):\n        raise OSError('no weights in /models')\n" + VERBS,
         "P",
     ),
-    "exits": ("import sys\nclass P:\n    def __init__(self):\n        sys.exit('bye')\n", "P"),
+    "exits": ("import sys\nclass P:\n    def __init__(self):\n        sys.exit('bye')\n" + VERBS, "P"),
     "syntax": ("class P:\n    def act(self:\n", "P"),
     "imports": ("import a_package_that_is_not_there\n", "P"),
     "script": ("import sys\nsys.exit(3)\n", "P"),
@@ -315,7 +316,7 @@ def test_a_disk_without_space_when_the_folder_is_made(world: FakeWorld, monkeypa
 
     monkeypatch.setattr(Path, "mkdir", full)
     done = evaluate("--policy", "zero")
-    assert_one_sentence(done, "the results in here cannot be written: No space left on device", status=1)
+    assert_one_sentence(done, "the results in here cannot be written: No space left on device")
     assert "--resume" not in done.stderr
 
 
@@ -349,7 +350,7 @@ def test_a_file_that_cannot_grow_during_the_run_costs_no_verdict(tmp_path: Path)
     arguments = ("--suite", SUITE, "--policy", "zero", "--num-envs", "1", "--out", str(out), "--quiet")
     done = in_a_process(6000, *arguments)
     assert (done.returncode, done.stderr) == (
-        1,
+        2,
         f"error: {out / 'episodes.jsonl'} cannot be written: File too large. What was computed is kept; to go on: "
         f"vecenv eval --resume {out}\n",
     )

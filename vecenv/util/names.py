@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection
 
+# Characters of a name in a message; a file may hold any.
+_MOST_SHOWN = 100
+
 
 def unknown(what: str, given: str, known: Collection[str]) -> str:
     """Say that a name is not known, and which known names come close (all of them when none does).
@@ -14,5 +17,6 @@ def unknown(what: str, given: str, known: Collection[str]) -> str:
         given: the name that is not known.
         known: the names that are.
     """
+    given = given[:_MOST_SHOWN]
     close = difflib.get_close_matches(given, known, n=3) or known
     return f"unknown {what} {given!r}: did you mean {', '.join(close)}?"

@@ -2,8 +2,9 @@
 
 Options or a YAML file come in; a progress bar, a table with Wilson 95 % intervals and the path of the results folder
 come out (``vecenv_eval.cli.screen``), or one JSON object a line with ``--json`` (``vecenv_eval.cli.json_lines``). The
-exit status is 0 when every episode has a verdict, 1 when some have none, 2 when the arguments are wrong and 130 after
-Ctrl-C (what was computed is kept, and the command that resumes it is printed).
+exit status is 0 when every episode has a verdict, 1 when some have none, 2 when the arguments are wrong or the results
+folder cannot be read or written, 130 after Ctrl-C and 143 after SIGTERM (what was computed is kept, and the command
+that resumes it is printed).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from vecenv.cli import fail
 from vecenv.errors import MissingDependency, VecenvError
 from vecenv.util.logs import reported
 from vecenv_eval.cli.options import given_settings, with_settings
+from vecenv_eval.cli.signals import INTERRUPTED, TERMINATED, Terminated, stopping
 from vecenv_eval.config import ConfigError, EvalConfig, option_name, read_settings, setting
 
 if TYPE_CHECKING:
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 
 
 _log = logging.getLogger(__name__)
+# Settings that decide results and are nevertheless given with --resume: `vecenv_eval.results.refuse_untold`.
+_GIVEN_AGAIN = ("policy", "policy_args")
 
 
 class Display(Protocol):
@@ -73,7 +77,10 @@ def eval_command(
         show_default="results/TIME_SUITE_POLICY",
     ),
     resume: Path | None = typer.Option(
-        None, help="Results folder to continue; it keeps its settings.", show_default="none"
+        None,
+        help="Results folder to continue; it keeps its settings. A policy of your own, with its arguments, and an "
+        "engine are given again.",
+        show_default="none",
     ),
     quiet: bool = typer.Option(False, "--quiet", help="Print the path of the results folder and nothing else."),
     as_json: bool = typer.Option(
@@ -86,8 +93,9 @@ def eval_command(
         fail("give --quiet or --json, not both")
     sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
     reports = nullcontext() if quiet else reported()  # of what is compiled, which takes minutes on a GPU
-    with _display(quiet, as_json) as display, reports, _user_errors(display):
+    with _display(quiet, as_json) as display, reports, _user_errors(display), stopping() as stop:
         status, folder = _evaluate(display, given_settings(settings), config, out, resume)
+        status = stop.status if status == INTERRUPTED else status
         display.end(status, folder)
     raise typer.Exit(status)
 
@@ -100,16 +108,19 @@ def _evaluate(
 
     if resume is not None and (resume / CAMPAIGN).exists():
         _refuse_settings(resume, given, config, out)
-        return _run_campaign(display, Campaign.open(resume))
+        with _stopped(resume):
+            return _run_campaign(display, Campaign.open(resume, **given))
     if resume is not None:
-        with _disk_errors(resume):
-            evaluation, store = _resume(resume, given, config, out)
-        return _run(display, evaluation, store)
+        with _stopped(resume):
+            with _disk_errors(resume):
+                evaluation, store = _resume(resume, given, config, out)
+            return _run(display, evaluation, store)
     wanted = _wanted(given, config)
     folder = out or _default_folder(wanted)
-    if is_campaign(wanted):
-        return _run_campaign(display, Campaign(wanted, folder))
-    return _run_new(display, wanted, folder)
+    with _stopped(folder):
+        if is_campaign(wanted):
+            return _run_campaign(display, Campaign(wanted, folder))
+        return _run_new(display, wanted, folder)
 
 
 @contextmanager
@@ -158,20 +169,18 @@ def _resume(folder: Path, given: dict[str, Any], file: Path | None, out: Path | 
     from vecenv_eval.results import resume
     from vecenv_eval.runner import Evaluation
 
-    _refuse_settings(folder, given, file, out, but_resumable=True)
+    _refuse_settings(folder, given, file, out)
     config, store = resume(folder, **given)
     return Evaluation(config), store
 
 
-def _refuse_settings(
-    folder: Path, given: dict[str, Any], file: Path | None, out: Path | None, but_resumable: bool = False
-) -> None:
-    """Refuse settings that the folder holds already."""
+def _refuse_settings(folder: Path, given: dict[str, Any], file: Path | None, out: Path | None) -> None:
+    """Refuse settings that the folder holds already, but those that may have to be given again."""
     refused = [
         *(
             option_name(each)
             for each in fields(EvalConfig)
-            if each.name in given and not (but_resumable and setting(each).resumable)
+            if each.name in given and each.name not in _GIVEN_AGAIN and not setting(each).resumable
         ),
         *(name for name, value in (("--config", file), ("--out", out)) if value),
     ]
@@ -188,7 +197,7 @@ def _run_campaign(display: Display, campaign: Campaign) -> tuple[int, Path]:
         )
     display.campaign(summary)
     if any(result.interrupted for result in results):
-        return 130, campaign.folder
+        return INTERRUPTED, campaign.folder
     complete = len(results) == len(campaign.legs) and all(result.ok for result in results)
     return (0 if complete else 1), campaign.folder
 
@@ -204,7 +213,7 @@ def _run(display: Display, evaluation: Evaluation, store: ResultStore) -> tuple[
     with _disk_errors(store.folder):
         result = evaluation.run(store, lambda now: display.progress(leg, now))
     display.result(leg, result)
-    return (130 if result.interrupted else 0 if result.ok else 1), result.folder
+    return (INTERRUPTED if result.interrupted else 0 if result.ok else 1), result.folder
 
 
 def _say_how_rows_are_kept(store: ResultStore) -> None:
@@ -213,32 +222,63 @@ def _say_how_rows_are_kept(store: ResultStore) -> None:
 
 
 class _RunError(VecenvError, RuntimeError):
-    """A run that cannot go on; the message says why, and how to continue it."""
+    """A run that cannot go on; the message says why, and how to continue it.
+
+    Attributes:
+        status: the command's exit status.
+    """
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+@contextmanager
+def _stopped(folder: Path) -> Iterator[None]:
+    """Ctrl-C or SIGTERM outside the episodes, while something is set up: one line that says how to go on."""
+    from vecenv_eval.results import CAMPAIGN, resume_command
+    from vecenv_eval.store import CONFIG
+
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        by, status = (str(stop), TERMINATED) if isinstance(stop, Terminated) else ("Ctrl-C", INTERRUPTED)
+        if any((folder / name).is_file() for name in (CONFIG, CAMPAIGN)):
+            how = f"what was computed is kept; to go on: {resume_command(folder)}"
+        else:
+            how = "nothing was computed yet; to begin again, repeat the command"
+        raise _RunError(f"stopped by {by} before the first episode or between two: {how}", status) from stop
 
 
 @contextmanager
 def _disk_errors(folder: Path) -> Iterator[None]:
     """Results that cannot be written, or read: whatever else raises such an error has been dealt with below."""
-    from vecenv_eval.results import CAMPAIGN
+    from vecenv_eval.results import CAMPAIGN, resume_command
     from vecenv_eval.store import CONFIG, StoreWriteError
 
     try:
         yield
     except (OSError, StoreWriteError) as error:
         there = any((folder / name).is_file() for name in (CONFIG, CAMPAIGN))
-        again = f" What was computed is kept; to go on: vecenv eval --resume {folder}" if there else ""
+        again = f" What was computed is kept; to go on: {resume_command(folder)}" if there else ""
         what = (
-            f"the results in {folder} cannot be written: {error.strerror or error}"
+            f"the results in {folder} cannot be written: {error.strerror or error}{_which(error, folder)}"
             if isinstance(error, OSError)
             else error
         )
-        raise _RunError(f"{what}.{again}") from error
+        raise _RunError(f"{what}.{again}", 2) from error
+
+
+def _which(error: OSError, folder: Path) -> str:
+    """The file that an error is about, if it is in the folder."""
+    name = error.filename if isinstance(error.filename, str) else ""
+    return f" ({Path(name).relative_to(folder)})" if name and Path(name).is_relative_to(folder / "") else ""
 
 
 @contextmanager
 def _user_errors(display: Display) -> Iterator[None]:
-    """A mistake of the user, or a cluster that cannot be used, becomes one line and exit status 2; a run that cannot go
-    on exit status 1."""
+    """A mistake of the user, or a cluster that cannot be used, becomes one line and exit status 2, as does a run that
+    cannot go on."""
     from vecenv_eval.engine import EngineError
     from vecenv_eval.episodes import SpecError
     from vecenv_eval.policies import PolicyError
@@ -247,7 +287,7 @@ def _user_errors(display: Display) -> Iterator[None]:
     try:
         yield
     except (ConfigError, EngineError, PolicyError, SpecError, StoreError, MissingDependency, _RunError) as error:
-        message, status = " ".join(str(error).split()), 1 if isinstance(error, _RunError) else 2
+        message, status = " ".join(str(error).split()), error.status if isinstance(error, _RunError) else 2
         display.failed(message, status)
         fail(message, status)
     except typer.Exit as exit:  # said already

@@ -2,7 +2,7 @@
 
 Results folders come in; one comes out, with the table and the files that a single run would have left. The exit
 status is 0 when every episode has a verdict, 1 when some have none (yet) or a package is missing, and 2 when the
-folders do not belong together.
+folders do not belong together, or cannot be read or written.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def merge_command(
     except VecenvError as error:
         fail(" ".join(str(error).split()))
     except OSError as error:
-        fail(f"{error.filename or out} cannot be read or written: {error.strerror}", code=1)
+        fail(f"{error.filename or out} cannot be read or written: {error.strerror}")
     for result in merged.results:
         print_result(console, result)
     if merged.summary is not None:

@@ -24,6 +24,7 @@ from vecenv_eval.campaign import CampaignSummary, Leg
 from vecenv_eval.campaign import table as campaign_table
 from vecenv_eval.pace import Pace, Rates
 from vecenv_eval.report import STAND_INS, closing_line, sanitized_line, stand_in_lines, table
+from vecenv_eval.results import resume_command
 
 if TYPE_CHECKING:
     from vecenv_eval.config import EvalConfig
@@ -150,7 +151,7 @@ def print_result(console: Console, result: EvalResult) -> None:
     for cause in result.causes:
         console.print(f"error that ended episodes: {cause}", style="red", **plain)
     if not result.ok:
-        console.print(f"Episodes lack a verdict; to run them: vecenv eval --resume {result.folder}", **plain)
+        console.print(f"Episodes lack a verdict; to run them: {resume_command(result.folder)}", **plain)
 
 
 class _Live:

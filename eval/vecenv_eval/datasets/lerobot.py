@@ -5,16 +5,16 @@ come in; a folder that ``lerobot.datasets.LeRobotDataset(repo_id, root=folder)``
 ``observation.state``, ``action``, the images under the names LeRobot's own LIBERO datasets use, ``next.done`` and
 ``next.success``; each episode in ``meta/episodes`` also has ``success``, ``suite``, ``task_id`` and ``source_episode``.
 
-Images are encoded as they come, in a file for each episode and camera; the rest is kept until 100 episodes have ended,
-then written. So memory is bounded, and after a crash the dataset is whole and lacks the last episodes at most. Needs
-``av`` and ``pyarrow``, both in the extra ``datasets``.
+Images are encoded as they come, in a file for each episode and camera. An episode is on the disk when ``finish``
+returns, in a folder of its own (``waiting``); 100 of them at a time are written to the dataset's files, so memory is
+bounded. After a crash, a writer takes up what waited. Needs ``av`` and ``pyarrow``, both in the extra ``datasets``.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,11 +22,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vecenv.contract import ACTION_DIM
-from vecenv.errors import InvalidFile, MissingDependency
+from vecenv.errors import MissingDependency
 from vecenv.observations import choose_cameras
+from vecenv_eval.datasets import files, waiting
+from vecenv_eval.datasets.files import CHUNK, DATA, EPISODES, INFO, STATS, TASKS, VERSION, VIDEO
 from vecenv_eval.datasets.statistics import ImageCounts, Statistics, of_values, together
+from vecenv_eval.datasets.waiting import PARTIAL, DatasetError, Waiting
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store import Record
+from vecenv_eval.store.files import replace_text
 from vecenv_eval.video.episodes import camera_images
 from vecenv_eval.video.writer import VideoWriter
 from vecenv_eval.watch import Observable
@@ -34,23 +38,14 @@ from vecenv_eval.watch import Observable
 if TYPE_CHECKING:
     import pyarrow as pa
 
-VERSION = "v3.0"
 # Cameras -> features, as in LeRobot's own LIBERO datasets and environment.
 IMAGE_KEYS = {"agentview": "observation.images.image", "wrist": "observation.images.image2"}
 _KEY_OF_OTHERS = "observation.images.{}"
 ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 LIBERO_STATE_NAMES = ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right")
 ROBOTS = {"simpler/bridge": "widowx", "simpler/google_robot": "google_robot"}
-# Files in a folder; episodes that are kept before they are written; ticks between images whose values are counted.
-CHUNK, FLUSH, COUNT_EVERY = 1000, 100, 4
-_DATA, _EPISODES = "data/chunk-{0:03d}/file-{1:03d}.parquet", "meta/episodes/chunk-{0:03d}/file-{1:03d}.parquet"
-_VIDEO = "videos/{key}/chunk-{0:03d}/file-{1:03d}.mp4"
-_INFO, _STATS, _TASKS, _PARTIAL = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", ".partial"
-_SCALARS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
-
-
-class DatasetError(InvalidFile):
-    """A dataset cannot be continued, or an episode does not fit it."""
+# Episodes that wait before they are written to the dataset's files; ticks between images whose values are counted.
+FLUSH, COUNT_EVERY = 100, 4
 
 
 def image_keys(cameras: Sequence[str] = ()) -> dict[str, str]:
@@ -77,26 +72,76 @@ class LeRobotWriter:
     Args:
         root: the dataset's folder.
         image_keys: camera -> feature; cameras that an environment does not have are left out.
-
-    Attributes:
-        episodes: how many the dataset has, those not written yet included.
+        verdicts: of an evaluation, gives the episodes that have a verdict on the disk. With it, an episode is in the
+            dataset once, and only with its verdict: what a killed process recorded without one is dropped.
 
     Raises:
-        DatasetError: there is something else at ``root``.
+        DatasetError: there is something else at ``root``, it is damaged, or an episode in it has no verdict.
         MissingDependency: pyarrow is not installed.
     """
 
-    def __init__(self, root: Path, image_keys: Mapping[str, str] = IMAGE_KEYS) -> None:
+    def __init__(
+        self,
+        root: Path,
+        image_keys: Mapping[str, str] = IMAGE_KEYS,
+        verdicts: Callable[[], Collection[Episode]] | None = None,
+    ) -> None:
         try:
             import pyarrow  # noqa: F401 - fail before an episode has run
         except ImportError:
             raise MissingDependency("LeRobot datasets need pyarrow: pip install 'vecenv[datasets]'") from None
         self.root, self._image_keys = root, dict(image_keys)
         self._rollouts: dict[int, _Rollout] = {}
-        self._rows: list[tuple[pa.Table, dict[str, Any]]] = []
-        self._info, self._tasks, self._stats = _read(root)
-        self.episodes, self._frames = self._info.get("total_episodes", 0), self._info.get("total_frames", 0)
-        self._files = len(list(root.glob("data/*/*.parquet")))
+        self._verdicts = verdicts
+        there = files.open_to_write(root)
+        self._info: dict[str, Any] = dict(there.info)
+        self._tasks, self._stats, self._files = there.tasks, there.stats, there.files
+        self._written = there.keys
+        self._waiting = self._take_up()
+
+    @property
+    def episodes(self) -> int:
+        """How many the dataset has, those that wait included."""
+        return self._total + len(self._waiting)
+
+    @property
+    def keys(self) -> frozenset[Episode]:
+        """Which episodes the dataset has, those that wait included."""
+        return frozenset((*self._written, *(each.key for each in self._waiting)))
+
+    @property
+    def _total(self) -> int:
+        """Episodes in the dataset's files."""
+        return self._info.get("total_episodes", 0)
+
+    def _take_up(self) -> list[Waiting]:
+        """The episodes that wait since a process was killed; those that have no verdict are dropped."""
+        shutil.rmtree(self.root / PARTIAL, ignore_errors=True)
+        done = None if self._verdicts is None else frozenset(self._verdicts())
+        if done is not None and (strangers := sorted(frozenset(self._written) - done)):
+            raise DatasetError(
+                f"{self.root} holds {strangers[0].id}, which has no verdict in these results: if they were merged, "
+                "merge them again, else move the dataset away"
+            )
+        kept: dict[Episode | int, Waiting] = {}
+        for folder in waiting.folders(self.root):
+            if int(folder.name) < self._total:
+                waiting.remove(folder)  # it is in the files: the process was killed before it could tidy up
+                continue
+            each = waiting.load(folder)
+            if done is not None and each.key not in done:
+                waiting.remove(folder)
+                continue
+            name = len(kept) if done is None else each.key
+            if name in kept:
+                waiting.remove(kept[name].folder)
+            kept[name] = each
+        found = list(kept.values())
+        if found and "fps" not in self._info:
+            self._info |= dict(found[0].info)
+        for each in found:
+            self._check_features(dict(each.info["features"]), each.key, each.info["robot_type"])
+        return waiting.renumber(found, [], self._total)[0] if found else []
 
     def begin(self, env: Observable, episodes: Mapping[int, Episode]) -> None:
         """Drop what there is of these slots: ticks of an episode that never finished."""
@@ -145,7 +190,6 @@ class LeRobotWriter:
         for video in rollout.videos.values():
             video.close()
         self._check_features(_features(rollout, self._info["fps"]), record.key, ROBOTS.get(record.suite, "panda"))
-        task = self._tasks.setdefault(record.instruction, len(self._tasks))
         videos = {key: video.path for key, video in rollout.videos.items()}
         about = {
             "tasks": [record.instruction],
@@ -155,7 +199,7 @@ class LeRobotWriter:
             "source_episode": record.episode,
         }
         images = {key: counts.statistics() for key, counts in rollout.counts.items()}
-        self._add(self._columns(rollout, record, task), images, videos, about)
+        self._add(self._columns(rollout, record), images, videos, about)
 
     def _add(
         self,
@@ -165,48 +209,66 @@ class LeRobotWriter:
         about: Mapping[str, Any],
     ) -> None:
         """Add an episode: its frames, the statistics of its images, its videos (which are moved), and what is told."""
-        stats = {name: of_values(values) for name, values in columns.items()} | dict(images)
-        self._stats = {
-            name: together([self._stats[name], s] if name in self._stats else [s]) for name, s in stats.items()
-        }
-        ticks = len(columns["index"])
-        self._rows.append((_table(columns), self._episode(ticks, stats, videos, about)))
-        self.episodes, self._frames = self.episodes + 1, self._frames + ticks
-        if len(self._rows) >= FLUSH:
+        if len(self._waiting) >= FLUSH:
             self.flush()
+        number, info = self.episodes, {name: self._info[name] for name in self._info if name not in files.TOTALS}
+        key = Episode(about["suite"], about["task_id"], about["source_episode"])
+        if self._verdicts is not None:  # of an episode that ended in an error after it was recorded, the new recording
+            for index, each in enumerate(self._waiting):
+                if each.key == key:
+                    self._waiting[index] = waiting.save(self.root, each.number, columns, images, videos, about, info)
+                    return
+        self._waiting.append(waiting.save(self.root, number, columns, images, videos, about, info))
 
     def close(self) -> None:
-        """Write what has ended, drop what has not. Closing twice is harmless."""
-        for rollout in self._rollouts.values():
-            for video in rollout.videos.values():
-                video.close()
-        self._rollouts.clear()
-        self.flush()
-        shutil.rmtree(self.root / _PARTIAL, ignore_errors=True)
+        """Write what has ended to the dataset's files, drop what has not. Closing twice is harmless."""
+        try:
+            for rollout in self._rollouts.values():
+                for video in rollout.videos.values():
+                    video.close()
+        finally:
+            self._rollouts.clear()
+            self.flush()
+            for folder in (PARTIAL, *([] if self._waiting else [waiting.PENDING])):
+                shutil.rmtree(self.root / folder, ignore_errors=True)
 
     def flush(self) -> None:
-        """Write the episodes that have ended: data first, what points to it last."""
-        if not self._rows:
-            return
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+        """Write the episodes that wait to the dataset's files: data first, what counts them last.
 
+        Of an evaluation, only those that have a verdict.
+        """
+        done = None if self._verdicts is None or not self._waiting else frozenset(self._verdicts())
+        ready = [each for each in self._waiting if done is None or each.key in done]
+        if not ready:
+            return
+        ready, rest = waiting.renumber(ready, [each for each in self._waiting if each not in ready], self._total)
+        self._waiting = [*ready, *rest]
         place = divmod(self._files, CHUNK)
-        where = {"data/chunk_index": place[0], "data/file_index": place[1]}
-        where |= {
-            f"meta/episodes/{name}": index for name, index in zip(("chunk_index", "file_index"), place, strict=True)
-        }
-        data, episodes = self._parent(_DATA.format(*place)), self._parent(_EPISODES.format(*place))
-        with pq.ParquetWriter(data, self._rows[0][0].schema) as writer:
-            for table, _ in self._rows:
-                writer.write_table(table)
-        pq.write_table(pa.Table.from_pylist([row | where for _, row in self._rows]), episodes)
-        pq.write_table(_tasks_table(self._tasks), self._parent(_TASKS))
-        self._write_json(_STATS, {n: {k: v.tolist() for k, v in stats.items()} for n, stats in self._stats.items()})
-        totals = {"total_episodes": self.episodes, "total_frames": self._frames, "total_tasks": len(self._tasks)}
-        self._info |= totals | {"splits": {"train": f"0:{self.episodes}"}}
-        self._write_json(_INFO, self._info)
-        self._rows, self._files = [], self._files + 1
+        tasks, frames = dict(self._tasks), self._info.get("total_frames", 0)
+        stats, rows, tables = dict(self._stats), [], []
+        for each in ready:
+            task = tasks.setdefault(each.about["tasks"][0], len(tasks))
+            columns = {**each.columns, **self._indices(each, frames, task)}
+            own = {name: of_values(values) for name, values in columns.items()} | dict(each.images)
+            stats |= {name: together([stats[name], s] if name in stats else [s]) for name, s in own.items()}
+            rows.append(self._row(each, frames, own, place))
+            tables.append(waiting.table_of(columns))
+            frames += len(each)
+        import pyarrow as pa
+
+        waiting.write_parquet(self._parent(DATA.format(*place)), tables)
+        waiting.write_parquet(self._parent(EPISODES.format(*place)), [pa.Table.from_pylist(rows)])
+        waiting.write_parquet(self._parent(TASKS), [_tasks_table(tasks)])
+        self._write_json(STATS, {n: {k: v.tolist() for k, v in found.items()} for n, found in stats.items()})
+        total = self._total + len(ready)
+        totals = {"total_episodes": total, "total_frames": frames, "total_tasks": len(tasks)}
+        info: dict[str, Any] = {**self._info, **totals, "splits": {"train": f"0:{total}"}}
+        self._write_json(INFO, info)
+        self._info, self._tasks, self._stats, self._files = info, tasks, stats, self._files + 1
+        self._written = (*self._written, *(each.key for each in ready))
+        self._waiting = rest
+        for each in ready:
+            waiting.remove(each.folder)
 
     def _fps(self, control_hz: float) -> int:
         known = self._info.get("fps", control_hz)
@@ -217,7 +279,7 @@ class LeRobotWriter:
     def _add_image(self, rollout: _Rollout, slot: int, key: str, image: np.ndarray, fps: int) -> None:
         if key not in rollout.videos:
             # A key frame every other frame, as LeRobot has it: frames are read in random order.
-            path = self.root / _PARTIAL / f"{slot}_{key}.mp4"
+            path = self.root / PARTIAL / f"{slot}_{key}.mp4"
             rollout.videos[key] = VideoWriter(path, fps, keyframes=2)
             rollout.counts[key] = ImageCounts()
         if rollout.videos[key].frames % COUNT_EVERY == 0:
@@ -243,8 +305,8 @@ class LeRobotWriter:
                 "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
             }
 
-    def _columns(self, rollout: _Rollout, record: Record, task: int) -> dict[str, np.ndarray]:
-        """An episode's frames, by feature: [T, n] or [T]."""
+    def _columns(self, rollout: _Rollout, record: Record) -> dict[str, np.ndarray]:
+        """An episode's frames, by feature, without the indices in the dataset: [T, n] or [T]."""
         ticks = len(rollout.actions)
         last = np.arange(ticks) == ticks - 1
         return {
@@ -254,36 +316,39 @@ class LeRobotWriter:
             "next.success": last & bool(record.success),
             "timestamp": (np.arange(ticks) / self._info["fps"]).astype(np.float32),
             "frame_index": np.arange(ticks),
-            **self._indices(ticks, task),
         }
 
-    def _indices(self, ticks: int, task: int) -> dict[str, np.ndarray]:
-        """The columns that depend on what the dataset holds already, [T] each."""
+    def _indices(self, episode: Waiting, start: int, task: int) -> dict[str, np.ndarray]:
+        """The columns that depend on what the dataset holds already, [T] each; ``start`` is its first frame."""
+        ticks = len(episode)
         return {
-            "episode_index": np.full(ticks, self.episodes),
-            "index": np.arange(self._frames, self._frames + ticks),
+            "episode_index": np.full(ticks, episode.number),
+            "index": np.arange(start, start + ticks),
             "task_index": np.full(ticks, task),
         }
 
-    def _episode(
-        self, ticks: int, stats: Mapping[str, Statistics], videos: Mapping[str, Path], about: Mapping[str, Any]
+    def _row(
+        self, episode: Waiting, start: int, stats: Mapping[str, Statistics], place: tuple[int, int]
     ) -> dict[str, Any]:
-        """The row of an episode in ``meta/episodes``; its videos move to their places."""
+        """The row of an episode in ``meta/episodes``; its videos get their places."""
+        ticks = len(episode)
         row: dict[str, Any] = {
-            "episode_index": self.episodes,
-            "tasks": about["tasks"],
+            "episode_index": episode.number,
+            "tasks": episode.about["tasks"],
             "length": ticks,
-            **{name: value for name, value in about.items() if name != "tasks"},
-            "dataset_from_index": self._frames,
-            "dataset_to_index": self._frames + ticks,
+            **{name: value for name, value in episode.about.items() if name != "tasks"},
+            "dataset_from_index": start,
+            "dataset_to_index": start + ticks,
         }
-        chunk, file = divmod(self.episodes, CHUNK)
-        for key, video in videos.items():
-            video.replace(self._parent(_VIDEO.format(chunk, file, key=key)))
+        chunk, file = divmod(episode.number, CHUNK)
+        for key in waiting.cameras_of(self._info):
+            waiting.place(episode.video(key), self.root / VIDEO.format(chunk, file, key=key))
             row |= {f"videos/{key}/chunk_index": chunk, f"videos/{key}/file_index": file}
             row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": ticks / self._info["fps"]}
         for name, found in stats.items():
             row |= {f"stats/{name}/{which}": value.tolist() for which, value in found.items()}
+        for name, index in zip(("chunk_index", "file_index"), place, strict=True):
+            row |= {f"data/{name}": index, f"meta/episodes/{name}": index}
         return row
 
     def _parent(self, name: str) -> Path:
@@ -292,33 +357,7 @@ class LeRobotWriter:
         return path
 
     def _write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        path = self._parent(name)
-        temporary = path.with_suffix(".tmp")
-        temporary.write_text(json.dumps(content, indent=4) + "\n")
-        temporary.replace(path)
-
-
-def _read(root: Path) -> tuple[dict[str, Any], dict[str, int], dict[str, Statistics]]:
-    """Info, tasks and statistics of the dataset at ``root``; empty where there is none yet."""
-    if not root.exists() or not any(root.iterdir()):
-        return {}, {}, {}
-    import pyarrow.parquet as pq
-
-    try:
-        info = json.loads((root / _INFO).read_text())
-        if info["codebase_version"] != VERSION:
-            raise DatasetError(f"{root} is a LeRobot dataset of format {info['codebase_version']}, not {VERSION}")
-        tasks = pq.read_table(root / _TASKS).to_pydict()
-        stats = json.loads((root / _STATS).read_text())
-        return (
-            info,
-            dict(zip(tasks["task"], tasks["task_index"], strict=True)),
-            {name: {k: np.array(v) for k, v in each.items()} for name, each in stats.items()},
-        )
-    except DatasetError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(f"{root} holds something other than a LeRobot dataset: {error}") from None
+        replace_text(self._parent(name), json.dumps(content, indent=4) + "\n")
 
 
 def _discard(rollout: _Rollout) -> None:
@@ -341,21 +380,8 @@ def _features(rollout: _Rollout, fps: int) -> dict[str, dict[str, Any]]:
         info |= {"has_audio": False, "is_depth_map": False}
         shape = [video.height, video.width, 3]
         found[key] = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": info}
-    scalars = {"next.done": "bool", "next.success": "bool", **_SCALARS}
+    scalars = {"next.done": "bool", "next.success": "bool", **waiting.SCALARS}
     return found | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in scalars.items()}
-
-
-def _table(columns: Mapping[str, np.ndarray]) -> pa.Table:
-    """An episode's frames; vectors as lists of a fixed length."""
-    import pyarrow as pa
-
-    arrays = {
-        name: pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
-        if values.ndim == 2
-        else pa.array(values)
-        for name, values in columns.items()
-    }
-    return pa.table(arrays)
 
 
 def _tasks_table(tasks: Mapping[str, int]) -> pa.Table:

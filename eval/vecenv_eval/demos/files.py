@@ -12,6 +12,9 @@ from vecenv_eval.demos.hdf5 import DemoError, Unreadable
 from vecenv_eval.demos.read import read_demos
 from vecenv_eval.demos.schema import SUFFIXES, Demo
 
+# Actions of all files that are replayed together; they take 56 bytes each.
+MOST_TICKS = 10_000_000
+
 
 class ReplayError(InvalidInput):
     """There is nothing to replay; the message names what was searched."""
@@ -35,11 +38,18 @@ def find_files(paths: Iterable[Path]) -> list[Path]:
 def read_files(
     files: Iterable[Path], *, suite: str | None = None, task: int | None = None
 ) -> tuple[list[Demo], list[Unreadable]]:
-    """Every demonstration of the files, and what cannot be used; see ``vecenv_eval.demos.read.read_demos``."""
+    """Every demonstration of the files, and what cannot be used; see ``vecenv_eval.demos.read.read_demos``.
+
+    One file that cannot be used costs itself alone; so does each one after `MOST_TICKS` actions.
+    """
     demos: list[Demo] = []
     problems: list[Unreadable] = []
     for path in files:
         try:
+            if sum(map(len, demos)) >= MOST_TICKS:
+                raise DemoError(
+                    f"{path}: the files before it have more than {MOST_TICKS:,} actions: replay fewer at once"
+                )
             good, bad = read_demos(path, suite=suite, task=task)
         except DemoError as error:
             good, bad = [], [Unreadable(path=path, name="", reason=str(error).removeprefix(f"{path}: "))]

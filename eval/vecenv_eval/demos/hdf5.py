@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import h5py
 import numpy as np
+from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]
 
 from vecenv.assets import AssetsMissing
 from vecenv.errors import InvalidInput
@@ -22,9 +23,11 @@ from vecenv.errors import InvalidInput
 # Far beyond any demonstration; a file that asks for more is damaged or hostile.
 _MAX_COLUMNS = 10_000
 _MAX_CHUNK_BYTES = 1 << 28
-_MAX_TEXT = 1 << 25
+_MOST_TEXT = 1 << 25
+# Metres, radians, their rates and seconds of any state; beyond it, simulations overflow.
+MOST_STATE = 1e6
 # What h5py and NumPy raise over a file that is damaged or holds something else.
-DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError)
+DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
 Kind = TypeVar("Kind", h5py.Group, h5py.Dataset)
 
@@ -65,7 +68,10 @@ class Opened:
         return self._file
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        try:
+            self._file.close()
+        except DAMAGE as error:
+            raise DemoError(f"{self._path}: {error_reason(error)}") from None
 
 
 class Errors:
@@ -98,6 +104,8 @@ def member(group: h5py.Group, name: str, kind: type[Kind]) -> Kind:
     member = group[name]
     if not isinstance(member, kind):
         raise DemoError(f"{name!r} is not a {what}")
+    if (count := h5o.get_info(member.id).rc) != 1:
+        raise DemoError(f"{name!r} has {count} links to it, which no {what} of a demonstration has")
     return member
 
 
@@ -115,7 +123,7 @@ def numeric_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
 
 def vector_attribute(group: h5py.Group, name: str) -> np.ndarray:
     """An attribute of numbers, float64 [1 + nq + nv]."""
-    value = np.asarray(group.attrs[name])
+    value = np.asarray(attribute(group, name))
     if value.dtype.kind not in "fiu" or value.ndim != 1 or len(value) > _MAX_COLUMNS:
         raise DemoError(
             f"attribute {name}: expected numbers [1 + nq + nv], got {value.dtype} {shape_text(value.shape)}"
@@ -123,22 +131,34 @@ def vector_attribute(group: h5py.Group, name: str) -> np.ndarray:
     return value.astype(float)
 
 
+def attribute(group: h5py.Group, name: str) -> Any:
+    """An attribute, None where there is none; nothing larger than a text may be is read."""
+    if name not in group.attrs:
+        return None
+    about = group.attrs.get_id(name)
+    if (size := about.get_storage_size()) > _MOST_TEXT or math.prod(about.shape) > _MOST_TEXT:
+        raise DemoError(f"attribute {name}: {size:,} bytes, more than {_MOST_TEXT:,}")
+    return group.attrs[name]
+
+
 def require_finite(name: str, values: np.ndarray) -> np.ndarray:
-    """The values; raises `DemoError` when one is not finite."""
+    """The values; raises `DemoError` when one is not finite, or so large that a simulation of it overflows."""
     if not np.isfinite(values).all():
         raise DemoError(f"{name}: holds a value that is not finite")
+    if (most := float(np.abs(values).max(initial=0.0))) > MOST_STATE:
+        raise DemoError(f"{name}: holds {most:g}, more than {MOST_STATE:g}")
     return values
 
 
 def text_attribute(group: h5py.Group, name: str) -> str | None:
     """An attribute of text; None where there is none."""
-    value = group.attrs.get(name)
+    value = attribute(group, name)
     if isinstance(value, bytes):
         value = value.decode()
     if value is not None and not isinstance(value, str):
         raise DemoError(f"attribute {name}: expected text, got {type(value).__name__}")
-    if value is not None and len(value) > _MAX_TEXT:
-        raise DemoError(f"attribute {name}: {len(value):,} characters, more than {_MAX_TEXT:,}")
+    if value is not None and len(value) > _MOST_TEXT:
+        raise DemoError(f"attribute {name}: {len(value):,} characters, more than {_MOST_TEXT:,}")
     return value
 
 
@@ -146,7 +166,7 @@ def json_attribute(group: h5py.Group, name: str) -> dict[str, Any]:
     """An attribute that holds a JSON object."""
     try:
         value = json.loads(text_attribute(group, name) or "")
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise DemoError(f"attribute {name}: not JSON: {error}") from None
     if not isinstance(value, dict):
         raise DemoError(f"attribute {name}: expected a JSON object, got {type(value).__name__}")

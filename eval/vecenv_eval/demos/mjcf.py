@@ -15,6 +15,9 @@ from vecenv.libero.tasks.suites import TaskSpec
 from vecenv_eval.demos.hdf5 import DemoError
 from vecenv_eval.demos.schema import Pose
 
+# Where fixtures may stand; numbers of a quaternion are smaller.
+_MOST_METRES = 100.0
+
 
 def fixture_poses(mjcf: str, spec: TaskSpec) -> dict[str, Pose]:
     """Where the fixtures of a task stand in an MJCF that upstream saved.
@@ -80,4 +83,6 @@ def _numbers(body: str, name: str, text: str, count: int) -> np.ndarray:
         values = np.zeros(0)
     if len(values) != count or not np.isfinite(values).all():
         raise DemoError(f"model_file: body {body}: {name}={text!r:.50}, expected {count} numbers")
+    if np.abs(values).max() > _MOST_METRES:
+        raise DemoError(f"model_file: body {body}: {name}={text!r:.50}: more than {_MOST_METRES:g} m from the origin")
     return values

@@ -1,14 +1,15 @@
 """Demonstrations read from HDF5 files, published ones and our own.
 
-Files come from anywhere, so nothing in them is trusted (see ``hdf5`` and ``mjcf``). What is wrong with one
-demonstration is reported about that one, and the others can still be used.
+Files come from anywhere, so nothing in them is trusted (see ``hdf5`` and ``mjcf``), and they are read in a process of
+their own (``reader``). What is wrong with one demonstration is reported about that one, and the others can still be
+used. Functions that end in ``_here`` read in this process.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ from vecenv_eval.demos.hdf5 import (
     Errors,
     Opened,
     Unreadable,
+    attribute,
     error_reason,
     json_attribute,
     member,
@@ -39,6 +41,7 @@ from vecenv_eval.demos.hdf5 import (
 )
 from vecenv_eval.demos.mjcf import fixture_poses
 from vecenv_eval.demos.options import check_options
+from vecenv_eval.demos.reader import READER
 from vecenv_eval.demos.schema import Demo, MadeStart, StoredStart
 
 if TYPE_CHECKING:
@@ -46,7 +49,9 @@ if TYPE_CHECKING:
 
 # Far beyond any demonstration; a file that asks for more is damaged or hostile.
 MAX_TICKS = 100_000
-_NAME = re.compile(r"demo_?(\d+)")
+# Of one file; LIBERO's published ones have 50 demonstrations of some hundred actions each.
+MOST_DEMOS, MOST_TICKS_OF_A_FILE = 20_000, 2_000_000
+_NAME = re.compile(r"demo_?([0-9]{1,18})")
 
 
 def read_demos(path: Path, *, suite: str | None = None, task: int | None = None) -> tuple[list[Demo], list[Unreadable]]:
@@ -61,17 +66,48 @@ def read_demos(path: Path, *, suite: str | None = None, task: int | None = None)
 
     Raises:
         DemoError: the file as a whole cannot be used.
+        AssetsMissing: files of a simulator are needed to read it.
     """
+    answer = READER.ask(path, "read", suite=suite, task=task)
+    demos = [_of_answer(path, values, answer.arrays) for values in answer.content["demos"]]
+    return demos, [Unreadable(path=path, name=name, reason=reason) for name, reason in answer.content["bad"]]
+
+
+def _of_answer(path: Path, values: Mapping[str, Any], arrays: Sequence[np.ndarray]) -> Demo:
+    """A demonstration as the reading process sent it."""
+    begins, second_half = values["start"], values["second_half"]
+    if "episode" in begins:
+        start = MadeStart(episode=begins["episode"], options=begins["options"])
+    else:
+        poses = begins["fixtures"]
+        fixtures = None if poses is None else {name: (arrays[a], arrays[b]) for name, (a, b) in poses.items()}
+        start = StoredStart(state=arrays[begins["state"]], fixtures=fixtures)
+    return Demo(
+        path=path,
+        name=values["name"],
+        suite=values["suite"],
+        task=values["task"],
+        start=start,
+        actions=arrays[values["actions"]],
+        success=values["success"],
+        second_half=None if second_half is None else arrays[second_half],
+        stand_ins=None if values["stand_ins"] is None else tuple(values["stand_ins"]),
+    )
+
+
+def read_here(path: Path, *, suite: str | None = None, task: int | None = None) -> tuple[list[Demo], list[Unreadable]]:
+    """As `read_demos`, in this process."""
     with Opened(path) as file, Errors(path):
         data = member(file, "data", h5py.Group)
         found, spec = _find_task(path, data, suite, task)
-        names = sorted((name for name in map(str, data) if _NAME.fullmatch(name)), key=_number)
-        if not names:
-            raise DemoError("its group 'data' holds no demonstrations (demo_0, demo_1, ...)")
-        demos, bad = [], []
+        names = demo_names(data)
+        demos, bad, ticks = [], [], 0
         for name in names:
             try:
+                if ticks >= MOST_TICKS_OF_A_FILE:
+                    raise DemoError(f"the file has more than {MOST_TICKS_OF_A_FILE:,} actions before it")
                 demos.append(_demo(path, data, name, found, spec))
+                ticks += len(demos[-1])
             except AssetsMissing:
                 raise
             except DAMAGE as error:
@@ -79,8 +115,55 @@ def read_demos(path: Path, *, suite: str | None = None, task: int | None = None)
         return demos, bad
 
 
+def demo_names(data: h5py.Group) -> list[str]:
+    """The demonstrations of a file in order of their numbers.
+
+    Raises:
+        DemoError: there are none, or too many.
+    """
+    if len(data) > MOST_DEMOS:
+        raise DemoError(f"its group 'data' has {len(data):,} members, more than {MOST_DEMOS:,}")
+    names = sorted((name for name in map(str, data) if _NAME.fullmatch(name)), key=_number)
+    if not names:
+        raise DemoError("its group 'data' holds no demonstrations (demo_0, demo_1, ...)")
+    return names
+
+
+def state_here(path: Path, name: str, ticks: int, length: int) -> np.ndarray | None:
+    """As ``Demo.recorded_state``, in this process.
+
+    Args:
+        path, name: the file, and the demonstration in it.
+        ticks: after how many.
+        length: how many actions the demonstration has.
+    """
+    with Opened(path) as file, Errors(path, name):
+        group = member(member(file, "data", h5py.Group), name, h5py.Group)
+        if ticks == length and "final_state" in group.attrs:
+            return require_finite("final_state", vector_attribute(group, "final_state"))
+        if "states" not in group or ticks >= length:
+            return None
+        return require_finite(f"states row {ticks}", np.asarray(states_dataset(group, length)[ticks], float))
+
+
+def check_here(path: Path) -> None:
+    """Read every dataset and attribute of a file of our own, in this process.
+
+    Raises:
+        DemoError: it is damaged, or something else.
+    """
+    with Opened(path) as file, Errors(path):
+        data = member(file, "data", h5py.Group)
+        for name in demo_names(data):
+            group = member(data, name, h5py.Group)
+            for inner in group:
+                numeric_dataset(group, str(inner))[()]
+            for each in group.attrs:
+                attribute(group, each)
+
+
 def _number(name: str) -> tuple[int, str]:
-    return int("".join(filter(str.isdecimal, name))), name
+    return int(name.removeprefix("demo").removeprefix("_")), name
 
 
 def _demo(path: Path, data: h5py.Group, name: str, suite: str, spec: TaskInfo) -> Demo:
@@ -117,7 +200,7 @@ def _actions(group: h5py.Group) -> np.ndarray:
 def _verdict(group: h5py.Group, ticks: int) -> bool | None:
     """Our own ``success``, else the last reward, else the last ``done`` (which is LIBERO's success), else None."""
     if "success" in group.attrs:
-        value = group.attrs["success"]
+        value = attribute(group, "success")
         if not isinstance(value, bool | np.bool_ | np.integer):
             raise DemoError(f"attribute success: expected true or false, got {value!r:.50}")
         return bool(value)
@@ -145,7 +228,7 @@ def _stand_ins(group: h5py.Group) -> tuple[str, ...] | None:
     text = text_attribute(group, "stand_ins")
     try:
         value = None if text is None else json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise DemoError(f"attribute stand_ins: not JSON: {error}") from None
     if value is not None and not (isinstance(value, list) and all(isinstance(each, str) for each in value)):
         raise DemoError("attribute stand_ins: expected a JSON list of texts")
@@ -178,7 +261,7 @@ def _made_start(group: h5py.Group, suite: str, spec: TaskInfo) -> MadeStart:
     options = json_attribute(group, "make")
     check_options(options, suite)
     count = NUM_EPISODES if isinstance(spec, TaskSpec) else _num_episodes(options, spec)
-    episode = group.attrs.get("episode")
+    episode = attribute(group, "episode")
     if not isinstance(episode, int | np.integer) or not 0 <= episode < count:
         raise DemoError(f"attribute episode: expected 0 to {count - 1}, got {episode!r:.50}")
     return MadeStart(episode=int(episode), options=options)
@@ -199,7 +282,7 @@ def _num_episodes(options: Mapping[str, Any], spec: TaskInfo) -> int:
 def _find_task(path: Path, data: h5py.Group, suite: str | None, task: int | None) -> tuple[str, TaskInfo]:
     """The task asked for; else the one the file names; else the one named as its task file or the file is."""
     if "suite" in data.attrs and ((suite is None and task is None) or vecenv.family(suite or "") != "libero"):
-        return _named_task(text_attribute(data, "suite"), data.attrs.get("task"), suite, task)
+        return _named_task(text_attribute(data, "suite"), attribute(data, "task"), suite, task)
     spec = _find_spec(path, data, suite, task)
     return spec.suite, spec
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import h5py
 import numpy as np
 
-from vecenv_eval.demos.hdf5 import Errors, Opened, member, require_finite, states_dataset, vector_attribute
+from vecenv_eval.demos.reader import READER
 from vecenv_eval.episodes import Episode
 
 SUFFIXES = (".hdf5", ".h5")
@@ -90,13 +89,8 @@ class Demo:
         Raises:
             DemoError: it is there and cannot be read, or is not finite.
         """
-        with Opened(self.path) as file, Errors(self.path, self.name):
-            group = member(member(file, "data", h5py.Group), self.name, h5py.Group)
-            if ticks == len(self) and "final_state" in group.attrs:
-                return require_finite("final_state", vector_attribute(group, "final_state"))
-            if "states" not in group or ticks >= len(self):
-                return None
-            return require_finite(f"states row {ticks}", np.asarray(states_dataset(group, len(self))[ticks], float))
+        answer = READER.ask(self.path, "state", name=self.name, ticks=ticks, length=len(self))
+        return None if answer.content["state"] is None else answer.arrays[answer.content["state"]]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,13 @@
-"""Recordings written to HDF5 files in LIBERO's layout; SIMPLER's have no BDDL file, and the name of their task."""
+"""Recordings written to HDF5 files in LIBERO's layout; SIMPLER's have no BDDL file, and the name of their task.
+
+HDF5 makes a file in memory, and the file goes to the disk as a whole: a full disk is an error like any other, which the
+HDF5 library does not see.
+"""
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +16,12 @@ import numpy as np
 
 import vecenv
 from vecenv.libero.tasks.suites import list_suites, list_tasks
+from vecenv_eval.demos.reader import READER
 from vecenv_eval.demos.schema import Recording
+from vecenv_eval.store.files import replace_bytes
+
+# Files that this process wrote, as they were then.
+_KNOWN: dict[Path, tuple[int, int, int]] = {}
 
 
 def write_demos(path: Path, suite: str, task: int, instruction: str, recordings: Sequence[Recording]) -> None:
@@ -26,23 +34,34 @@ def write_demos(path: Path, suite: str, task: int, instruction: str, recordings:
         suite, task: what is demonstrated.
         instruction: its language instruction.
         recordings: episodes of it.
+
+    Raises:
+        DemoError: there is something else, or it is damaged.
+        OSError: it cannot be written; what was there still is.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    if path.exists():
-        shutil.copyfile(path, temporary)
-    else:
-        temporary.unlink(missing_ok=True)
-    with h5py.File(temporary, "a") as file:
+    _check_once(path)
+    image = io.BytesIO(path.read_bytes() if path.exists() else b"")
+    with h5py.File(image, "a") as file:
         data = file.require_group("data")
         _describe(data, suite, task, instruction)
         for recording in recordings:
             _write_demo(data, recording)
         data.attrs["num_demos"] = len(data)
         data.attrs["total"] = sum(int(group.attrs["num_samples"]) for group in data.values())
-    with temporary.open("rb+") as file:
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    replace_bytes(path, image.getvalue())
+    _KNOWN[path.resolve()] = _stamp(path)
+
+
+def _check_once(path: Path) -> None:
+    """Have a file read by another process, unless this one wrote it: a damaged one may crash whoever opens it."""
+    if path.exists() and _KNOWN.get(path.resolve()) != _stamp(path):
+        READER.ask(path, "check")
+
+
+def _stamp(path: Path) -> tuple[int, int, int]:
+    about = path.stat()
+    return about.st_ino, about.st_size, about.st_mtime_ns
 
 
 def _describe(data: h5py.Group, suite: str, task: int, instruction: str) -> None:

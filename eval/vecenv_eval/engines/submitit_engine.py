@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+import uuid
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -143,9 +144,11 @@ class SubmititEngine:
             EngineError: it is not available here.
         """
         cluster = None if self._options.executor == "auto" else self._options.executor
-        logs.mkdir(parents=True, exist_ok=True)
+        # submitit unpickles what it finds under the names of its jobs: only what this run puts there is read.
+        own = logs / uuid.uuid4().hex
+        own.mkdir(parents=True)
         try:
-            executor = submitit.AutoExecutor(folder=logs, cluster=cluster)
+            executor = submitit.AutoExecutor(folder=own, cluster=cluster)
         except (RuntimeError, ValueError, OSError) as error:
             raise EngineError(f"no executor {self._options.executor!r} here: {' '.join(str(error).split())}") from error
         try:

@@ -45,7 +45,7 @@ def _copy_demos(store: ResultStore, source: ResultStore, keys: Sequence[Episode]
             by_task.setdefault((key.suite, key.task), []).append(key.episode)
     if not by_task:
         return
-    from vecenv_eval.merge.demos import copy_demos
+    from vecenv_eval.demos.copy import copy_demos
 
     for key, episodes in by_task.items():
         copy_demos(source.demos_path(*key), store.demos_path(*key), episodes)

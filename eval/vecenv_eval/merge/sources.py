@@ -16,7 +16,7 @@ from typing import Any
 from vecenv_eval.conditions import INDIFFERENT
 from vecenv_eval.config import EvalConfig, differences
 from vecenv_eval.episodes import Episode
-from vecenv_eval.results import resume
+from vecenv_eval.results import read_folder
 from vecenv_eval.store import Record, ResultStore, StoreError
 
 # Packages whose version decides what an episode does; others (trackers, encoders) may differ between machines.
@@ -73,7 +73,7 @@ def read_source(folder: Path) -> Source:
     Raises:
         StoreError: it is none, or it is damaged.
     """
-    config, store = resume(folder)
+    config, store = read_folder(folder)
     return Source(store, config, store.config(), store.records())
 
 

@@ -12,7 +12,7 @@ import inspect
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, get_type_hints, runtime_checkable
 
 import numpy as np
 
@@ -30,6 +30,7 @@ BUILTIN = {
     "voxposer": "vecenv_eval.policies.voxposer:VoxPoserPolicy",
     "zero": "vecenv_eval.policies.scripted:ZeroPolicy",
 }
+_NO_POLICY = "is not a policy: it needs a name, reset(env, info) and act(env)"
 
 
 class PolicyError(InvalidInput):
@@ -161,7 +162,8 @@ def make_policy(name: str, given: Mapping[str, Any] | None = None, /, *, seed: i
     """Make the policy called ``name``.
 
     Args:
-        name: one of ``BUILTIN``, or ``"module:Class"``.
+        name: one of ``BUILTIN``, or ``"module:Class"``: a class with the methods of a policy, a function whose return
+            annotation is one, or a policy. Nothing else of a module is called.
         given: constructor arguments, a ``seed`` among them if the policy is to have one of its own.
         seed: passed on to policies whose constructor takes a ``seed`` (unless ``given`` already has one).
         **arguments: further constructor arguments.
@@ -178,7 +180,7 @@ def make_policy(name: str, given: Mapping[str, Any] | None = None, /, *, seed: i
     except (Exception, SystemExit) as error:  # whatever a policy's constructor raises
         raise PolicyError(f"policy {name!r}: making it failed: {raised(error)}") from error
     if not isinstance(policy, Policy):
-        raise PolicyError(f"policy {name!r} is not a policy: it needs a name, reset(env, info) and act(env)")
+        raise PolicyError(f"policy {name!r} {_NO_POLICY}")
     return policy
 
 
@@ -201,7 +203,11 @@ def _bound(name: str, seed: int, arguments: Mapping[str, Any]) -> Callable[[], A
 
 
 def _load(name: str) -> Callable[..., object]:
-    """The class or function that makes the policy."""
+    """The class or function that makes the policy.
+
+    Raises:
+        PolicyError: there is none of this name, or it is something else.
+    """
     target = BUILTIN.get(name, name)
     module_name, separator, attribute = target.partition(":")
     if not (separator and module_name and attribute):
@@ -211,10 +217,24 @@ def _load(name: str) -> Callable[..., object]:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # whatever a module raises, a script that ends with sys.exit() included
         raise PolicyError(f"policy {name!r}: importing {module_name!r} failed: {raised(error)}") from error
-    factory = getattr(module, attribute, None)
-    if not callable(factory):
+    found = getattr(module, attribute, None)
+    if _makes_policies(found):
+        return found
+    if isinstance(found, Policy) and not isinstance(found, type):
+        return lambda: found
+    if not callable(found):
         raise PolicyError(f"policy {name!r}: the module {module_name!r} has no class {attribute!r}")
-    return factory
+    raise PolicyError(f"policy {name!r} {_NO_POLICY}")
+
+
+def _makes_policies(found: object) -> TypeGuard[Callable[..., object]]:
+    """Whether this is a class of policies, or a function that says that it returns one; nothing else is called."""
+    if inspect.isfunction(found):
+        try:
+            found = get_type_hints(found).get("return")
+        except Exception:  # whatever an annotation raises
+            return False
+    return isinstance(found, type) and all(callable(getattr(found, verb, None)) for verb in ("reset", "act"))
 
 
 def raised(error: BaseException) -> str:

@@ -6,15 +6,17 @@ damaged or come from elsewhere, so everything that a report uses is checked here
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vecenv_eval.conditions import checked_content
 from vecenv_eval.episodes import Episode
 from vecenv_eval.report.summary import Row, Summary, summarise
 from vecenv_eval.store import CONFIG, SUMMARY, Record, ResultStore, StoreError
+from vecenv_eval.store.files import read_json
+from vecenv_eval.store.record import MOST_EPISODES
 
 # LIBERO's four suites in the order in which papers print them, under the names they print.
 PAPER_NAMES = {
@@ -24,9 +26,6 @@ PAPER_NAMES = {
     "libero_10": "Long",
     "libero_90": "LIBERO-90",
 }
-_NUMBERS = ("task", "episode", "num_steps", "sanitized", "run", "batch")
-_SECONDS = ("wall_s", "setup_s", "policy_s", "physics_s", "images_s")
-_TEXTS = ("suite", "instruction", "fault", "error")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,15 +139,11 @@ def read_run(folder: Path) -> Run:
 def _read_folder(folder: Path) -> list[SuiteRun]:
     """The suites in one results folder."""
     store = ResultStore(folder)
-    try:
-        config, records = store.config(), sorted(store.records().values(), key=lambda record: record.key)
-    except (OSError, ValueError, TypeError) as error:
-        raise StoreError(f"{folder} cannot be read: {error}") from None
-    settings = config.get("config") if isinstance(config, dict) else None
+    config, records = store.config(), sorted(store.records().values(), key=lambda record: record.key)
+    checked_content(config, folder / CONFIG)
+    settings = config.get("config")
     if not isinstance(settings, dict) or not isinstance(settings.get("suite"), str):
         raise StoreError(f"{folder / CONFIG} does not say which suite was evaluated")
-    for record in records:
-        _check(record, folder)
     policy = str(settings.get("policy") or "the suite's scripted one")
     suites = dict.fromkeys(record.suite for record in records) or {settings["suite"]: None}
     stored = _stored_rows(folder)
@@ -188,39 +183,19 @@ def _suite_run(
     )
 
 
-def _check(record: Record, folder: Path) -> None:
-    """Refuse a record whose fields are not what they should be."""
-    for names, kind, what in (
-        (_NUMBERS, int, "a whole number"),
-        (_SECONDS, int | float, "a number"),
-        (_TEXTS, str, "text"),
-    ):
-        for name in names:
-            if not isinstance(value := getattr(record, name), kind):
-                raise StoreError(f"{folder}: {name} of episode {record.key.id} is {value!r:.50}, not {what}")
-    if not _are_parts(record.parts):
-        raise StoreError(f"{folder}: parts of episode {record.key.id} is {record.parts!r:.50}, not names and numbers")
-    if min(record.task, record.episode, record.num_steps) < 0 or record.task > 100_000:
-        raise StoreError(f"{folder}: episode {record.key.id} with {record.num_steps} steps cannot be")
-
-
-def _are_parts(value: object) -> bool:
-    """Whether a value maps names to true, false, numbers or nothing."""
-    if not isinstance(value, Mapping):
-        return False
-    return all(isinstance(name, str) and isinstance(each, int | float | None) for name, each in value.items())
-
-
 def _stored_rows(folder: Path) -> dict[int, Mapping[str, Any]] | None:
     """The rows of ``summary.json`` by task, for which episodes were planned; None where they cannot be read."""
     counts = ("episodes", "errors", "missing")
     try:
-        rows = json.loads((folder / SUMMARY).read_text())["tasks"]
-        return {
-            row["task"]: {"instruction": str(row["instruction"]), **{n: int(row[n]) for n in counts}} for row in rows
+        found: dict[int, Mapping[str, Any]] = {
+            row["task"]: {"instruction": str(row["instruction"]), **{name: row[name] for name in counts}}
+            for row in read_json(folder / SUMMARY)["tasks"]
         }
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, KeyError, TypeError, StoreError):
         return None
+    numbers = [*found, *(row[name] for row in found.values() for name in counts)]
+    usable = all(type(number) is int and 0 <= number <= MOST_EPISODES for number in numbers)
+    return found if usable else None
 
 
 def _with_missing(summary: Summary, stored: Mapping[int, Mapping[str, Any]]) -> Summary:

@@ -1,15 +1,71 @@
-"""Files that are whole after a crash or a power cut: replaced in one step, or appended to and synced."""
+"""Files that are whole after a crash or a power cut: replaced in one step, or appended to and synced.
+
+:func:`read_json` reads what may be damaged or a stranger's, with limits on its size, depth and numbers.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+from vecenv_eval.store.record import LARGEST, StoreError, unicode
+
+# Bytes of a JSON file, and levels of objects and lists in each other; ours have less than 1 MB and 10 levels.
+MOST_BYTES, MOST_LEVELS = 1 << 28, 64
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises:
+        OSError: the file cannot be read.
+        StoreError: it is larger than `MOST_BYTES`, is no JSON object, or holds what `parse_json` refuses.
+    """
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise StoreError(f"{path} cannot be read: it has {size:,} bytes, more than {MOST_BYTES:,}")
+    try:
+        content = parse_json(path.read_bytes())
+    except ValueError as error:
+        raise StoreError(f"{path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise StoreError(f"{path} cannot be read: it holds no JSON object")
+    return content
+
+
+def parse_json(text: bytes) -> Any:
+    """Plain values from JSON in UTF-8; texts have a form in UTF-8, which JSON does not promise.
+
+    Raises:
+        ValueError: it is none, its levels are too deep, or it holds a number that is too large.
+    """
+    try:
+        value = json.loads(text.decode("utf-8"))
+    except RecursionError:
+        raise ValueError(f"more than {MOST_LEVELS} levels of JSON") from None
+    return _checked(value, MOST_LEVELS)
+
+
+def _checked(value: Any, levels: int) -> Any:
+    """The value; depth is refused, and numbers that nothing else could store."""
+    if levels < 0:
+        raise ValueError(f"more than {MOST_LEVELS} levels of JSON")
+    if isinstance(value, dict):
+        return {unicode(name): _checked(each, levels - 1) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_checked(each, levels - 1) for each in value]
+    if isinstance(value, int) and abs(value) > LARGEST:
+        raise ValueError(f"a whole number has {len(str(abs(value)))} digits, more than can be stored")
+    return unicode(value) if isinstance(value, str) else value
 
 
 def append_text(path: Path, text: str) -> None:
     """Append to a file, or make it, and wait until it is on the disk."""
     new = not path.exists()
-    with path.open("a", encoding="utf-8") as file:
+    with naming(path), path.open("a", encoding="utf-8") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
@@ -23,14 +79,30 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def replace_bytes(path: Path, content: bytes) -> None:
-    """Replace a file in one step and wait until it is on the disk."""
+    """Replace a file in one step and wait until it is on the disk; when that fails, nothing new is left there."""
     temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with naming(path), temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
     sync_folder(path.parent)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors of the system inside name this file, where they name none: those of writing to an open file do not."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            error.filename = str(path)
+        raise
 
 
 def sync_folder(folder: Path) -> None:

@@ -18,13 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from vecenv_eval.episodes import Episode
-from vecenv_eval.store.files import append_text, replace_text
-from vecenv_eval.store.lock import LOCK, writing
+from vecenv_eval.store.files import append_text, read_json, replace_text
+from vecenv_eval.store.lock import HOST, LOCK, writing
 from vecenv_eval.store.record import Record, StoreError
 from vecenv_eval.store.rows import JSONL, Rows, rows_in
 
 CONFIG, ERRORS, SUMMARY, REPORT = "config.json", "errors.log", "summary.json", "report.md"
 DEMOS = "demos"
+_LOGS = "policy_logs/*.tmp"
 # Where results folders go unless something else is asked for.
 RESULTS = Path("results")
 
@@ -50,17 +51,23 @@ class ResultStore:
         Raises:
             StoreError: something is in the way.
         """
-        # A process that was killed while it made the folder leaves no more than these.
-        ours = {LOCK, f"{CONFIG}.tmp"}
+        cls._refuse_used(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        with writing(folder):
+            cls._refuse_used(folder)  # by a process that was quicker
+            store = cls(folder)
+            store.write_config({"id": uuid.uuid4().hex, **config})
+            store.rows.create()
+        return store
+
+    @staticmethod
+    def _refuse_used(folder: Path) -> None:
+        """Refuse a folder with something in it, but for what a process leaves that was killed while it made it."""
+        ours = {LOCK, HOST, f"{CONFIG}.tmp"}
         if folder.exists() and (not folder.is_dir() or any(path.name not in ours for path in folder.iterdir())):
             raise StoreError(
                 f"{folder} is already there and not empty: name another folder, or continue it with --resume"
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        store = cls(folder)
-        store.write_config({"id": uuid.uuid4().hex, **config})
-        store.rows.create()
-        return store
 
     @classmethod
     def open(cls, folder: Path) -> ResultStore:
@@ -96,14 +103,10 @@ class ResultStore:
 
     def config(self) -> dict[str, Any]:
         """Content of ``config.json``."""
-        path = self.folder / CONFIG
         try:
-            content = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise StoreError(f"{path} cannot be read: {error}") from None
-        if not isinstance(content, dict):
-            raise StoreError(f"{path} cannot be read: it holds no JSON object")
-        return content
+            return read_json(self.folder / CONFIG)
+        except OSError as error:
+            raise StoreError(f"{self.folder / CONFIG} cannot be read: {error.strerror}") from None
 
     def write_config(self, config: dict[str, Any]) -> None:
         """Replace ``config.json`` in one step."""
@@ -130,12 +133,18 @@ class ResultStore:
         """Add a traceback to ``errors.log``."""
         append_text(self.folder / ERRORS, text.rstrip() + "\n\n")
 
+    def tidy(self) -> None:
+        """Remove what a process that was killed left of files that it was replacing; for whoever is writing."""
+        for pattern in (f"{CONFIG}.tmp", f"{SUMMARY}.tmp", f"{REPORT}.tmp", f"{DEMOS}/*.tmp", f"{DEMOS}/*.new", _LOGS):
+            for path in self.folder.glob(pattern):
+                path.unlink(missing_ok=True)
+
     def discard(self) -> None:
         """Remove the folder if it holds no episode and nothing but what :meth:`create` puts there."""
         if self.rows.read():
             return
         self.rows.close()
-        ours = {self.folder / CONFIG, self.folder / LOCK, self.rows.path}
+        ours = {self.folder / CONFIG, self.folder / LOCK, self.folder / HOST, self.rows.path}
         if set(self.folder.iterdir()) <= ours:
             self.rows.remove()
             for path in ours:

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from vecenv_eval.episodes import Episode
-from vecenv_eval.store.files import append_text
+from vecenv_eval.store.files import append_text, parse_json
 from vecenv_eval.store.record import Record, StoreError, StoreWriteError, from_plain, to_plain
 
 EPISODES = "episodes.jsonl"
@@ -54,13 +54,14 @@ class JsonlRows:
             StoreError: the file cannot be read, or a line before the last is no record.
         """
         try:
-            text = self.path.read_text()
+            content = self.path.read_bytes()
         except FileNotFoundError:
             return {}
-        except (OSError, UnicodeDecodeError) as error:
-            raise StoreError(f"{self.path} cannot be read: {error}") from None
+        except OSError as error:
+            raise StoreError(f"{self.path} cannot be read: {error.strerror}") from None
         found: dict[Episode, Record] = {}
-        for number, line in enumerate(text.split("\n")[:-1], start=1):  # what follows the last newline is no whole line
+        *lines, rest = content.split(b"\n")
+        for number, line in enumerate([*lines, *_whole(rest)], start=1):
             record = _parse(line, f"{self.path}:{number}")
             if record.replaces(found.get(record.key)):
                 found[record.key] = record
@@ -86,15 +87,31 @@ class JsonlRows:
         self.path.unlink(missing_ok=True)
 
     def _repair(self) -> None:
-        """Cut the file after its last newline, so that the next line begins on its own."""
+        """Make the file end with a newline: after its last record if that lacks nothing else, or by cutting it off."""
         content = self.path.read_bytes() if self.path.exists() else b""
-        if not content.endswith(b"\n"):
-            with self.path.open("ab") as file:
-                file.truncate(content.rfind(b"\n") + 1)
+        if not content or content.endswith(b"\n"):
+            return
+        start = content.rfind(b"\n") + 1
+        with self.path.open("ab") as file:
+            if _whole(content[start:]):
+                file.write(b"\n")
+            else:
+                file.truncate(start)
 
 
-def _parse(line: str, where: str) -> Record:
+def _whole(rest: bytes) -> list[bytes]:
+    """What follows the last newline, if it is a record of which only the newline was cut off."""
     try:
-        return from_plain(json.loads(line))
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        from_plain(parse_json(rest))
+    except ValueError:
+        return []
+    return [rest]
+
+
+def _parse(line: bytes, where: str) -> Record:
+    try:
+        return from_plain(parse_json(line))
+    except UnicodeDecodeError as error:
+        raise StoreError(f"{where} is not an episode: byte {error.start + 1} is not UTF-8") from None
+    except ValueError as error:
         raise StoreError(f"{where} is not an episode: {error}") from None

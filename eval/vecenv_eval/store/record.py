@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -12,6 +12,19 @@ from vecenv_eval.episodes import Episode
 
 # Fields of a record that may differ when an episode is run again.
 CIRCUMSTANCES = frozenset({"run", "batch", "setup_s", "wall_s", "policy_s", "physics_s", "images_s"})
+# The largest whole number that fits into databases and tables.
+LARGEST = 2**63 - 1
+# Far beyond any suite; tables are made of rows up to the largest task.
+MOST_EPISODES = 1_000_000
+_MOST_SECONDS = 1e10
+# Levels of what a policy reports; what is deeper is stored as text.
+_MOST_LEVELS = 16
+# What a stored row must have, and the types of its fields.
+_NEEDED = frozenset({"suite", "task", "episode", "instruction", "success", "num_steps", "reward"})
+_FLAGS = frozenset({"success", "success_first", "success_final"})
+_COUNTS = frozenset({"task", "episode", "num_steps", "sanitized", "run", "batch"})
+_NUMBERS = frozenset({"reward", "setup_s", "wall_s", "policy_s", "physics_s", "images_s"})
+_TEXTS = frozenset({"suite", "instruction", "fault", "error"})
 
 
 class StoreError(InvalidFile):
@@ -105,26 +118,94 @@ class Record:
 
 
 def to_plain(record: Record) -> dict[str, Any]:
-    """A record as JSON has it: no NaN or infinity, which become null."""
-    return _finite(asdict(record))
+    """A record as JSON has it: no NaN or infinity, which become null, and no text without a form in UTF-8."""
+    return {each.name: _storable(getattr(record, each.name)) for each in fields(record)}
 
 
-def from_plain(values: Mapping[str, Any]) -> Record:
+def from_plain(values: object) -> Record:
     """A record from its plain form; fields that are not known are passed over.
 
     Raises:
-        KeyError, TypeError, AttributeError: it is none.
+        ValueError: it is none; the message names the field.
     """
-    known = {f.name for f in fields(Record)}
-    values = {key: value for key, value in values.items() if key in known}
+    if not isinstance(values, Mapping):
+        raise ValueError(f"it is {type(values).__name__}, not a JSON object")
+    known = {f.name: values[f.name] for f in fields(Record) if f.name in values}
+    if missing := [f.name for f in fields(Record) if f.name in _NEEDED and f.name not in known]:
+        raise ValueError(f"it has no {', '.join(missing)}")
     # Older files have one verdict, which is both.
-    both = {name: values.get(name, values["success"]) for name in ("success_first", "success_final")}
-    return Record(**{**values, **both, "stand_ins": tuple(values.get("stand_ins", ()))})
+    for name in ("success_first", "success_final"):
+        known.setdefault(name, known["success"])
+    for name, value in known.items():
+        _check(name, value)
+    known = _storable(known)
+    return Record(**{**known, "stand_ins": tuple(known.get("stand_ins", ()))})
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Mapping):
-        return {name: _finite(each) for name, each in value.items()}
-    return [_finite(each) for each in value] if isinstance(value, list | tuple) else value
+def _check(name: str, value: object) -> None:
+    """Refuse a value that the field of this name cannot have."""
+    if name in _FLAGS:
+        fits, what = isinstance(value, bool), "true or false"
+    elif name in _COUNTS or name == "sanitized_first":
+        whole = isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST
+        fits, what = whole or (value is None and name not in _COUNTS), "a whole number from 0"
+    elif name in _NUMBERS:
+        fits, what = _is_number(value), "a number"
+        if name == "reward":
+            fits = fits or value is None
+        elif fits:  # seconds: NaN is none
+            fits, what = 0 <= value <= _MOST_SECONDS, f"seconds, from 0 to {_MOST_SECONDS:g}"  # pyright: ignore[reportOperatorIssue]
+    elif name in _TEXTS:
+        fits, what = isinstance(value, str), "text"
+    elif name == "parts":
+        fits, what = isinstance(value, Mapping) and all(_is_part(each) for each in value.values()), "names and numbers"
+    elif name == "stand_ins":
+        fits = isinstance(value, Sequence) and not isinstance(value, str) and all(isinstance(e, str) for e in value)
+        what = "a list of texts"
+    else:
+        fits, what = isinstance(value, Mapping), "a JSON object"
+    if not fits:
+        raise ValueError(f"{name} is {value!r:.50}, not {what}")
+    if name in ("task", "episode") and value > MOST_EPISODES:  # pyright: ignore[reportOperatorIssue]
+        raise ValueError(f"{name} is {value!r:.50}, more than {MOST_EPISODES:,}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool))
+
+
+def _is_part(value: object) -> bool:
+    return value is None or isinstance(value, bool) or _is_number(value)
+
+
+def _storable(value: Any, levels: int = _MOST_LEVELS) -> Any:
+    """Plain values that every store takes and every reader understands: finite numbers, Unicode, few levels."""
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, str):
+        return unicode(value)
+    if isinstance(value, int):
+        return int(value) if abs(value) <= LARGEST else _text(value)
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Mapping | list | tuple) and levels:
+        if isinstance(value, Mapping):
+            return {_storable(str(name)): _storable(each, levels - 1) for name, each in value.items()}
+        return [_storable(each, levels - 1) for each in value]
+    to_list = getattr(value, "tolist", None)  # of NumPy's numbers and arrays
+    if callable(to_list) and levels:
+        return _storable(to_list(), levels - 1)
+    return _text(value)
+
+
+def unicode(text: str) -> str:
+    """A text as UTF-8 can hold it: surrogates, which file names of other encodings may have, are written as escapes."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def _text(value: object) -> str:
+    """Something that has no form of its own in a store."""
+    try:
+        return _storable(f"{value!r:.1000}")
+    except Exception:  # whatever a __repr__ raises, or a number with too many digits
+        return type(value).__name__

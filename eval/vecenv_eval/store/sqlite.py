@@ -8,14 +8,18 @@ log does not work over a network.
 from __future__ import annotations
 
 import json
+import logging
+import shutil
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from vecenv_eval.episodes import Episode
+from vecenv_eval.store.files import parse_json
 from vecenv_eval.store.filesystems import file_system, is_local
 from vecenv_eval.store.record import Record, StoreError, StoreWriteError, from_plain, to_plain
 
@@ -49,6 +53,8 @@ COLUMNS = {
     "parts": "JSON NOT NULL",
 }
 KEY = ("suite", "task", "episode")
+# Truth values as SQLite stores them.
+_FLAGS = {0: False, 1: True}
 _NAMES = ", ".join(COLUMNS)
 _CREATE = f"CREATE TABLE episodes ({', '.join(map(' '.join, COLUMNS.items()))}, PRIMARY KEY ({', '.join(KEY)}))"
 # As Record.replaces: the latest record counts, but no error replaces a verdict.
@@ -58,8 +64,14 @@ _INSERT = (
     f"DO UPDATE SET {', '.join(f'{name} = excluded.{name}' for name in COLUMNS if name not in KEY)} "
     "WHERE excluded.error = '' OR episodes.error <> ''"
 )
-# Seconds to wait for another process that holds the database.
-_TIMEOUT_S = 30.0
+# Seconds that a reader waits for another process that holds the database, and that a writer does at a time.
+_TIMEOUT_S, _WRITER_S = 30.0, 5.0
+# Seconds that a writer waits in all: what it has was computed, and whoever reads will be done some time.
+_PATIENCE_S = 3600.0
+# Seconds for reading all rows, and bytes of one value: beyond any run's, so that a stranger's database is no trap.
+_READING_S, _MOST_BYTES = 300.0, 1 << 26
+_BUSY = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+_log = logging.getLogger(__name__)
 
 
 class SqliteRows:
@@ -83,15 +95,19 @@ class SqliteRows:
     def create(self) -> None:
         """Make the database, without records, if there is none."""
         with self._errors("written"):
-            self._writer()
+            self._patiently(self._writer)
 
     def append(self, records: Iterable[Record]) -> None:
         """Add records in one transaction and wait until it is on the disk."""
         rows = [sqlite_values(to_plain(record)) for record in records]
-        with self._errors("written"):
+
+        def write() -> None:
             connection = self._writer()
             with connection:
                 connection.executemany(_INSERT, rows)
+
+        with self._errors("written"):
+            self._patiently(write)
 
     def read(self) -> dict[Episode, Record]:
         """The record of each episode, by episode, in the order in which they first came.
@@ -146,10 +162,22 @@ class SqliteRows:
         for ending in ("", "-wal", "-shm", "-journal"):
             self.path.with_name(self.path.name + ending).unlink(missing_ok=True)
 
+    def _patiently(self, work: Callable[[], object]) -> None:
+        """Do something again while another process has the database, of which the log speaks."""
+        until = time.monotonic() + _PATIENCE_S
+        while True:
+            try:
+                work()
+                return
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode & 0xFF not in _BUSY or time.monotonic() > until:
+                    raise
+                _log.warning("%s: another process holds the database; waiting to write", self.path)
+
     def _writer(self) -> sqlite3.Connection:
         """The connection that writes, with a table to write to."""
         if self._connection is None:
-            connection = sqlite3.connect(self.path, timeout=_TIMEOUT_S, check_same_thread=False)
+            connection = sqlite3.connect(self.path, timeout=_WRITER_S, check_same_thread=False)
             try:
                 self.journal = _set_journal(connection, self.journal)
                 connection.execute("PRAGMA synchronous = FULL")
@@ -170,13 +198,28 @@ class SqliteRows:
         connection = sqlite3.connect(uri, uri=True, timeout=_TIMEOUT_S)
         try:
             connection.execute("PRAGMA schema_version")
-        except sqlite3.OperationalError:
+        except sqlite3.OperationalError as error:
             connection.close()
-            if self.path.with_name(self.path.name + "-wal").exists():
+            log = self.path.with_name(self.path.name + "-wal")
+            if error.sqlite_errorcode & 0xFF in _BUSY:
                 raise
-            # In a folder without write permission SQLite cannot make the log's files, and does not need them.
-            connection = sqlite3.connect(f"{uri}&immutable=1", uri=True)
-        return connection
+            # In a folder without write permission SQLite cannot make the log's files. It needs them only if there is a
+            # log, which a killed process left: then a copy is read.
+            if log.exists() and log.stat().st_size:
+                connection = self._reader_of_copy(log)
+            else:
+                connection = sqlite3.connect(f"{uri}&immutable=1", uri=True)
+        return _limited(connection)
+
+    def _reader_of_copy(self, log: Path) -> sqlite3.Connection:
+        """A connection to a copy in memory of the database and its log."""
+        with TemporaryDirectory(prefix="vecenv-") as folder, self._errors("read"):
+            for path in (self.path, log):
+                shutil.copyfile(path, Path(folder) / path.name)
+            memory = sqlite3.connect(":memory:")
+            with closing(sqlite3.connect(Path(folder) / self.path.name)) as copy:
+                copy.backup(memory)
+        return memory
 
     def _has_table(self, connection: sqlite3.Connection) -> bool:
         """Whether there is the table; a database without anything in it is one that was not begun.
@@ -196,11 +239,15 @@ class SqliteRows:
 
     def _record(self, values: Mapping[str, Any]) -> Record:
         try:
-            flags = {name: bool(values[name]) for name, kind in COLUMNS.items() if kind.startswith("BOOLEAN")}
-            texts = {name: json.loads(values[name]) for name, kind in COLUMNS.items() if kind.startswith("JSON")}
+            flags = {name: _FLAGS.get(values[name]) for name, kind in COLUMNS.items() if kind.startswith("BOOLEAN")}
+            texts = {
+                name: parse_json(str(values[name]).encode())
+                for name, kind in COLUMNS.items()
+                if kind.startswith("JSON")
+            }
             return from_plain({**values, **flags, **texts})
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            which = "/".join(str(values[name]) for name in KEY)
+        except (ValueError, TypeError) as error:
+            which = "/".join(f"{values[name]!s:.50}" for name in KEY)
             raise StoreError(f"{self.path}: the row of {which} is not an episode: {error}") from None
 
     @contextmanager
@@ -208,9 +255,18 @@ class SqliteRows:
         """What SQLite raises becomes a `StoreError` that names the file."""
         try:
             yield
-        except (sqlite3.Error, UnicodeDecodeError) as error:
+        except (sqlite3.Error, OSError, UnicodeDecodeError, OverflowError, MemoryError) as error:
             kind = StoreWriteError if done == "written" else StoreError
             raise kind(f"{self.path} cannot be {done}: {error}") from None
+
+
+def _limited(connection: sqlite3.Connection) -> sqlite3.Connection:
+    """A connection that gives up on values and statements that no run's database has."""
+    until = time.monotonic() + _READING_S
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_BYTES)
+    connection.set_progress_handler(lambda: time.monotonic() > until, 100_000)
+    connection.execute("PRAGMA trusted_schema = OFF")
+    return connection
 
 
 def _set_journal(connection: sqlite3.Connection, mode: str) -> str:

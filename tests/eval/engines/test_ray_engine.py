@@ -200,7 +200,7 @@ def test_what_a_policy_or_environment_raises_costs_the_running_episodes(tmp_path
     assert result.causes == ("ValueError: the sky fell",)
     assert len(result.records) == 20
     assert "in pieces" in (result.folder / "errors.log").read_text()
-    again = evaluate(*resume(result.folder), simulator=FakeWorld().simulator)
+    again = evaluate(*resume(result.folder, engine="ray", engine_args={"actors": 1}), simulator=FakeWorld().simulator)
     assert again.ok
     assert verdicts(again) == verdicts(local(tmp_path / "local", FakeWorld()))
 

@@ -107,14 +107,13 @@ import sys
 from pathlib import Path
 from support.fakes import FakeWorld
 from vecenv_eval.config import EvalConfig
-from vecenv_eval.results import begin, resume
+from vecenv_eval.results import open_or_begin
 from vecenv_eval.runner import evaluate
 
 folder = Path(sys.argv[1])
 config = EvalConfig(suite="fake_suite", policy="support.slow_policy:SlowPolicy", num_envs=1, engine="ray",
                     engine_args={"actors": 2, "unit": 2})
-config, store = resume(folder) if folder.exists() else (config, begin(config, folder))
-result = evaluate(config, store, simulator=FakeWorld().simulator)
+result = evaluate(config, open_or_begin(config, folder), simulator=FakeWorld().simulator)
 sys.exit(130 if result.interrupted else 0 if result.ok else 1)
 """
 
@@ -151,6 +150,7 @@ def test_a_driver_that_is_ended_leaves_no_process_and_the_same_command_resumes(t
     assert 3 <= lines(folder) < 20
     assert subprocess.run(command, env=environment, check=False).returncode == 0
     assert lines(folder) == 20
-    result = evaluate(*resume(folder), simulator=FakeWorld().simulator)  # nothing is left to run
+    told = resume(folder, policy="support.slow_policy:SlowPolicy", engine="local")
+    result = evaluate(*told, simulator=FakeWorld().simulator)  # nothing is left to run
     assert verdicts(result) == verdicts(local(tmp_path / "local"))
     assert len({record.key for record in result.records}) == 20

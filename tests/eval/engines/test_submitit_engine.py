@@ -248,5 +248,6 @@ def test_a_driver_that_is_ended_is_resumed_by_the_same_command(tmp_path: Path, h
     assert 3 <= lines(folder) < 20
     assert subprocess.run(command, check=False, timeout=120).returncode == 0
     assert lines(folder) == 20
-    result = evaluate(*resume(folder), simulator=FakeWorld().simulator)
+    told = resume(folder, policy=SLOW, engine="submitit", engine_args=LOCAL)
+    result = evaluate(*told, simulator=FakeWorld().simulator)
     assert verdicts(result) == verdicts(local(tmp_path / "local", policy=SLOW))

@@ -35,7 +35,7 @@ _SHARPNESS = 5.0
 # How far below a thing's top a hand takes hold of it: about the length of the finger pads, metres.
 _GRASP_DEPTH = 0.03
 # Within about this distance of the grasp point closing the hand counts as progress, metres.
-_GRASP_RADIUS = 0.03
+_GRASP_RADIUS = 0.015
 # What is carried passes this far above what stands around its place, and at least this far above the ground, metres.
 _CLEARANCE, _RAISED = 0.03, 0.05
 # Carrying counts from this horizontal distance on, every centimetre of it the same, metres.
