@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from vecenv.libero.config import LiberoError
 from vecenv.libero.physics.base import Group, Physics
 from vecenv.libero.robot import BASE_BODY
 from vecenv.libero.scene import surface
@@ -63,11 +62,7 @@ def objects(
         points: ``"surface"`` or ``"aabb"``, see ``LiberoEnv.observe_objects``.
         slots: indices of the slots to observe; the others have no snapshot.
 
-    Raises:
-        LiberoError: other ``points``.
     """
-    if points not in ("surface", "aabb"):
-        raise LiberoError(f"points={points!r}: expected 'surface' or 'aabb'")
     snapshots: list[ObjectsSnapshot | None] = [None] * len(problems)
     wanted = np.isin(np.arange(len(problems)), slots)
     for group in groups:

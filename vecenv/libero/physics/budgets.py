@@ -26,7 +26,7 @@ from vecenv.errors import InvalidInput
 from vecenv.libero.physics.base import Group, Start
 from vecenv.libero.scene.elements import CONTACT_LIMIT, PAIR_LIMIT
 from vecenv.libero.scene.scene import Scene
-from vecenv.util import caching
+from vecenv.util import caching, configs, inputs
 
 log = logging.getLogger(__name__)
 # Factors on the measured maxima. Two boxes have up to eight published contacts, and the number changes from substep to
@@ -70,9 +70,8 @@ class Budget:
     share: int | None = None
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if value is not None and value < 1:
-                raise BudgetError(f"{name}={value}: need at least 1")
+        counts = {name: (1, inputs.MOST_COUNT) for name in configs.field_names(type(self))}
+        configs.check(self, BudgetError, ranges=counts)
 
     def warp_sizes(self, num_worlds: int) -> dict[str, int]:
         """Arguments for ``mjx.make_data(impl="warp")``."""
