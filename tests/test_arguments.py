@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
+from support.calls import NEVER, VERBS, plan_with, told
 
 import vecenv
 from vecenv.contract import State
@@ -18,92 +19,6 @@ from vecenv.placement import Placement, PlacementError
 
 B = 2
 BRIDGE = "simpler/bridge"
-
-
-class NoArray:
-    """Converts itself to nothing."""
-
-    def __array__(self, *_: object, **__: object) -> np.ndarray:
-        raise RuntimeError("it cannot be converted")
-
-    def __repr__(self) -> str:
-        raise RuntimeError("it cannot be shown")
-
-
-# Nothing that any argument takes. Functions, because generators are read once.
-NEVER: dict[str, Callable[[], Any]] = {
-    "object": object,
-    "NoArray": NoArray,
-    "complex": lambda: 1j,
-    "text": lambda: "\x00up",
-    "bytes": lambda: b"01",
-    "set": lambda: {0.5, 1},
-    "mapping": lambda: {"a": 1},
-    "objects": lambda: np.array([None, 1], object),
-    "date": lambda: np.datetime64("2020-01-01"),
-    "ragged": lambda: [[0, 1], [2]],
-    "cube": lambda: np.zeros((2, 2, 2)),
-    "not a number": lambda: float("nan"),
-    "infinite": lambda: [np.inf, 0.0],
-    "huge": lambda: np.broadcast_to(0.0, (10**6, 10**6)),
-    "endless": lambda: itertools.repeat(0.5),
-    "masked": lambda: np.ma.masked_array([0, 1], mask=[True, False]),
-    "type": lambda: float,
-    "too large": lambda: 2**64,
-    "very negative": lambda: -(2**70),
-    "float index": lambda: 1.5,
-    "mixed": lambda: [True, 1],
-}
-
-
-class Call(NamedTuple):
-    """A call of a verb with a value in the place of one argument."""
-
-    verb: Callable[[Any, Any], object]
-    # What of ``NEVER`` it takes after all, or what is something else for it.
-    takes: frozenset[str] = frozenset()
-
-
-def plan_with(name: str, value: object) -> dict[str, object]:
-    plan: dict[str, object] = {
-        "poses": np.tile([0.0, 0, 1, 1, 0, 0, 0], (B, 1, 1)),
-        "grip": np.zeros((B, 1)),
-        "hold": np.zeros((B, 1), int),
-        "valid": np.zeros((B, 1), bool),
-    }
-    return {**plan, name: value}
-
-
-VERBS: dict[str, Call] = {
-    "end_episodes(slots)": Call(lambda env, value: env.end_episodes(value)),
-    "observe_egocentric(slots)": Call(lambda env, value: env.observe_egocentric(slots=value)),
-    "observe_objects(slots)": Call(lambda env, value: env.observe_objects(slots=value)),
-    "observe_objects(points)": Call(lambda env, value: env.observe_objects(value)),
-    "set_episodes(tasks)": Call(lambda env, value: env.set_episodes(tasks=value)),
-    "set_episodes(episodes)": Call(lambda env, value: env.set_episodes(episodes=value)),
-    "set_episodes(slots)": Call(lambda env, value: env.set_episodes(episodes=1, slots=value)),
-    "set_episodes(tasks of a slot)": Call(lambda env, value: env.set_episodes(tasks=value, slots=[0])),
-    "set_episodes(episodes of a slot)": Call(lambda env, value: env.set_episodes(episodes=value, slots=[0])),
-    "step_continuous": Call(lambda env, value: env.step_continuous(value)),
-    "step_ee_pose(poses)": Call(lambda env, value: env.step_ee_pose(value)),
-    "step_ee_pose(hold_steps)": Call(lambda env, value: env.step_ee_pose([], hold_steps=value)),
-    "step_ee_pose(carry)": Call(lambda env, value: env.step_ee_pose([], carry=value)),
-    "step_ee_pose(slots)": Call(lambda env, value: env.step_ee_pose([], slots=value)),
-    "step_waypoints(plan)": Call(lambda env, value: env.step_waypoints(value)),
-    "step_waypoints(max_misses)": Call(lambda env, value: env.step_waypoints(plan_with("grip", [[0]] * B), value)),
-    **{
-        f"step_waypoints({name})": Call(lambda env, value, name=name: env.step_waypoints(plan_with(name, value)))
-        for name in ("poses", "grip", "hold", "valid", "unknown")
-    },
-    "set_state": Call(lambda env, value: env.set_state(value)),
-    **{
-        f"set_state({name})": Call(
-            lambda env, value, name=name: env.set_state(dataclasses.replace(env.state(), **{name: value}))
-        )
-        for name in ("qpos", "qvel", "time", "nq", "nv")
-    },
-    "watched": Call(lambda env, value: env.watched(value).__enter__(), frozenset({"type"})),
-}
 
 
 @pytest.fixture(scope="module", params=["libero_object", BRIDGE])
@@ -117,15 +32,6 @@ def env(request: pytest.FixtureRequest, small: Path) -> Iterator[Any]:
     made.step_continuous(np.full((B, 2, 7), 0.1))
     yield made
     made.close()
-
-
-def told(env: Any) -> list[Any]:
-    """All that a batch says about itself."""
-    state, metrics = env.state(), env.evaluate()
-    placed = env.placement
-    arrays = [state.qpos, state.qvel, state.time, placed.task, placed.episode, env.done]
-    arrays += [metrics.num_steps, metrics.success, metrics.cumulative_reward]
-    return [array.tolist() for array in arrays]
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -7,6 +7,7 @@ their start states, goals and instructions, which are data. Read ``vecenv/contra
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, cast
@@ -346,9 +347,10 @@ class LiberoEnv(SlotBatch):
     def check_success(self) -> np.ndarray:
         """Whether each slot's goal holds in its present state, bool [B]; unlike ``evaluate`` not tied to a tick."""
         self._check_live()
-        for group in self.physics.groups:
-            group.refresh_all()
-        return self.physics.judge()
+        with contextlib.ExitStack() as refreshed:
+            for group in self.physics.groups:
+                refreshed.enter_context(group.refreshed(contacts=True))
+            return self.physics.judge()
 
     # -- physics state -------------------------------------------------------------------------------------------------
 
