@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.calls import NEVER, VERBS, plan_with, told
+from support.calls import NEVER, VERBS, plan, told
 
 import vecenv
 from vecenv.contract import State
@@ -69,7 +69,7 @@ def test_a_mapping_of_a_pose_has_known_keys_and_a_pose(env: Any) -> None:
     with pytest.raises(ValueError, match="a mapping without 'pose'"):
         env.step_ee_pose({"hold_steps": 3})
     with pytest.raises(ValueError, match="plan: unknown key 'girp'; expected poses, grip, hold, valid"):
-        env.step_waypoints(plan_with("girp", np.zeros((B, 1))))
+        env.step_waypoints(plan(env, "girp", np.zeros((B, 1))))
 
 
 def test_a_state_of_other_scenes_is_refused_and_says_so(env: Any) -> None:
@@ -160,7 +160,9 @@ def test_what_make_takes_nowhere_is_refused_there(suite: str, small: Path) -> No
     usual: dict[str, Any] = {"task": 0, "episodes": [0], **({"assets": small} if suite == BRIDGE else {})}
     config = vecenv.registry.family_of(suite).config_type()
     names = [field.name for field in dataclasses.fields(config)]
-    for name, (label, value) in itertools.product(["suite", "task", "tasks", "episodes", "config", *names], NEVER.items()):
+    for name, (label, value) in itertools.product(
+        ["suite", "task", "tasks", "episodes", "config", *names], NEVER.items()
+    ):
         options = {**usual, "suite": suite, name: value()}
         if name == "tasks":
             del options["task"]
@@ -230,7 +232,12 @@ def test_generators_are_read_once_and_serve_every_task(suite: str, small: Path) 
 def test_visual_options_are_numbers_and_visual_options() -> None:
     from vecenv.libero.render.options import CameraShift, RenderError, UserCamera, VisualOptions
 
-    for wrong in ({"light": np.nan}, {"light_color": (1, 1)}, {"colors": {"robot": "red"}}, {"cameras": {"agentview": 3}}):
+    for wrong in (
+        {"light": np.nan},
+        {"light_color": (1, 1)},
+        {"colors": {"robot": "red"}},
+        {"cameras": {"agentview": 3}},
+    ):
         with pytest.raises(RenderError):
             VisualOptions(**wrong)  # type: ignore[arg-type]
     with pytest.raises(RenderError, match="pos"):

@@ -273,7 +273,9 @@ def _named(part: str, what: str, names: Sequence[str]) -> int:
         raise SpecError(f"{what} {part!r} fits {len(fitting)}: {', '.join(_some(fitting))}; write more of the name")
     near = difflib.get_close_matches(part, names, n=3) or list(names)
     close = f"; did you mean {', '.join(_some(near))}?" if near else ""
-    raise SpecError(f"cannot read {inputs.shown(part)} as {what}s: write indices and ranges such as 0,3,5-7, or 'all'{close}")
+    raise SpecError(
+        f"cannot read {inputs.shown(part)} as {what}s: write indices and ranges such as 0,3,5-7, or 'all'{close}"
+    )
 
 
 def _plain(name: str) -> str:

@@ -54,14 +54,15 @@ class Call(NamedTuple):
     takes: frozenset[str] = frozenset()
 
 
-def plan_with(name: str, value: object, num_envs: int = 2) -> dict[str, object]:
-    plan: dict[str, object] = {
-        "poses": np.tile([0.0, 0, 1, 1, 0, 0, 0], (num_envs, 1, 1)),
-        "grip": np.zeros((num_envs, 1)),
-        "hold": np.zeros((num_envs, 1), int),
-        "valid": np.zeros((num_envs, 1), bool),
+def plan(env: Any, name: str = "valid", value: object = False) -> dict[str, object]:
+    """A plan of one waypoint a slot that nothing follows, with one of its fields replaced or added."""
+    fields = {
+        "poses": np.tile([0.0, 0, 1, 1, 0, 0, 0], (env.num_envs, 1, 1)),
+        "grip": np.zeros((env.num_envs, 1)),
+        "hold": np.zeros((env.num_envs, 1), int),
+        "valid": np.zeros((env.num_envs, 1), bool),
     }
-    return {**plan, name: value}
+    return {**fields, name: np.full((env.num_envs, 1), False) if value is False else value}
 
 
 VERBS: dict[str, Call] = {
@@ -80,9 +81,13 @@ VERBS: dict[str, Call] = {
     "step_ee_pose(carry)": Call(lambda env, value: env.step_ee_pose([], carry=value)),
     "step_ee_pose(slots)": Call(lambda env, value: env.step_ee_pose([], slots=value)),
     "step_waypoints(plan)": Call(lambda env, value: env.step_waypoints(value)),
-    "step_waypoints(max_misses)": Call(lambda env, value: env.step_waypoints(plan_with("grip", [[0]] * env.num_envs, env.num_envs), value)),
+    "step_waypoints(max_misses)": Call(
+        lambda env, value: env.step_waypoints(plan_with("grip", [[0]] * env.num_envs, env.num_envs), value)
+    ),
     **{
-        f"step_waypoints({name})": Call(lambda env, value, name=name: env.step_waypoints(plan_with(name, value, env.num_envs)))
+        f"step_waypoints({name})": Call(
+            lambda env, value, name=name: env.step_waypoints(plan_with(name, value, env.num_envs))
+        )
         for name in ("poses", "grip", "hold", "valid", "unknown")
     },
     "set_state": Call(lambda env, value: env.set_state(value)),

@@ -32,7 +32,6 @@ from vecenv.util import configs, inputs
 from vecenv.util.arrays import AnyArray
 from vecenv.util.rotations import quat_mul, quat_normalize, require_tail, rotation_between, rotvec_to_quat, safe_norm
 
-
 _SERVO_NUMBERS = ("pos_tol", "rot_tol", "max_advance_pos", "max_advance_rot", "max_lead_pos", "max_lead_rot")
 
 

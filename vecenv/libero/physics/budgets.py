@@ -70,7 +70,7 @@ class Budget:
     share: int | None = None
 
     def __post_init__(self) -> None:
-        counts = {name: (1, inputs.MOST_COUNT) for name in configs.field_names(type(self))}
+        counts = dict.fromkeys(configs.field_names(type(self)), (1, inputs.MOST_COUNT))
         configs.check(self, BudgetError, ranges=counts)
 
     def warp_sizes(self, num_worlds: int) -> dict[str, int]:

@@ -130,7 +130,9 @@ class VisualOptions:
 
     def __post_init__(self) -> None:
         if isinstance(self.colors, Mapping):
-            scales = {name: configs.vector(value, f"colors[{name!r}]", RenderError) for name, value in self.colors.items()}
+            scales = {
+                name: configs.vector(value, f"colors[{name!r}]", RenderError) for name, value in self.colors.items()
+            }
             object.__setattr__(self, "colors", scales)
         configs.check(self, RenderError, vectors=("light_color", "light_shift"))
 

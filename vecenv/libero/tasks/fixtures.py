@@ -186,7 +186,9 @@ def check(fixtures: str | Mapping[str, Any], scenes: Sequence[Scene], num_envs: 
         _rows(name, *arrays, range(num_envs))
         for label, array in zip(("pos", "quat"), arrays, strict=True):
             if array.ndim == 2 and len(array) != num_envs:
-                raise FixtureError(f"fixtures[{name!r}] {label}: {len(array)} rows for {num_envs} slots; expected one a slot")
+                raise FixtureError(
+                    f"fixtures[{name!r}] {label}: {len(array)} rows for {num_envs} slots; expected one a slot"
+                )
 
 
 def _rows(name: str, pos: np.ndarray, quat: np.ndarray, slots: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
