@@ -81,13 +81,9 @@ VERBS: dict[str, Call] = {
     "step_ee_pose(carry)": Call(lambda env, value: env.step_ee_pose([], carry=value)),
     "step_ee_pose(slots)": Call(lambda env, value: env.step_ee_pose([], slots=value)),
     "step_waypoints(plan)": Call(lambda env, value: env.step_waypoints(value)),
-    "step_waypoints(max_misses)": Call(
-        lambda env, value: env.step_waypoints(plan_with("grip", [[0]] * env.num_envs, env.num_envs), value)
-    ),
+    "step_waypoints(max_misses)": Call(lambda env, value: env.step_waypoints(plan(env), value)),
     **{
-        f"step_waypoints({name})": Call(
-            lambda env, value, name=name: env.step_waypoints(plan_with(name, value, env.num_envs))
-        )
+        f"step_waypoints({name})": Call(lambda env, value, name=name: env.step_waypoints(plan(env, name, value)))
         for name in ("poses", "grip", "hold", "valid", "unknown")
     },
     "set_state": Call(lambda env, value: env.set_state(value)),

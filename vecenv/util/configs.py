@@ -98,7 +98,7 @@ def check(
     vectors: Sequence[str] = (),
     ranges: Mapping[str, tuple[int, int]] | None = None,
 ) -> None:
-    """Check the fields of a frozen dataclass in its ``__post_init__``, however it was made; NumPy scalars become Python's.
+    """Check the fields of a frozen dataclass, in its ``__post_init__``; NumPy scalars become Python's.
 
     Args:
         instance: the dataclass.
