@@ -154,14 +154,18 @@ def cached(scene: Scene, starts: Start) -> Budget:
     folder = caching.folder("budgets")
     if folder is None:
         return measure(scene, starts)
-    path = folder / f"{key_of(scene, starts)}.json"
-    with contextlib.suppress(OSError, ValueError, TypeError):
-        return Budget(**json.loads(path.read_bytes()))
+    path = folder / f"{key_of(scene, starts)}.budget"
+    data = caching.unsealed(path)
+    if data is not None:
+        try:
+            return Budget(**json.loads(data))
+        except (ValueError, TypeError, RecursionError):
+            caching.damaged(path, "not a budget")
     log.info("measuring the contact memory of a scene on native MuJoCo, %d worlds", len(starts.qpos))
     budget = measure(scene, starts)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        caching.write_file(path, json.dumps(asdict(budget)).encode())
+        caching.write_file(path, caching.sealed(json.dumps(asdict(budget)).encode()))
     return budget
 
 
