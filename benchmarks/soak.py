@@ -86,12 +86,12 @@ class Meter:
             self.note()
 
 
-def evaluations(meter: Meter, until: float, *, slots: int, budget: int, size: int) -> None:
+def evaluations(meter: Meter, until: float, *, tasks: str, slots: int, budget: int, size: int) -> None:
     """Evaluate, again and again, with refills and images."""
     while time.monotonic() < until:
         config = EvalConfig(
             suite=SUITE,
-            tasks="0-1",
+            tasks=tasks,
             episodes=str(slots + 1),
             policy="soak:LookingPolicy",
             max_steps=budget,
@@ -132,6 +132,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="how long, both parts together")
     parser.add_argument("--slots", type=int, default=512, help="slots of the batch")
     parser.add_argument("--ticks", type=int, default=2500, help="budget of its episodes")
+    parser.add_argument("--tasks", default="0-1", help="tasks of the evaluations; each compiles a scene to draw")
     parser.add_argument("--eval-slots", type=int, default=4, help="slots of the evaluations")
     parser.add_argument("--eval-ticks", type=int, default=40, help="budget of their episodes")
     parser.add_argument("--size", type=int, default=128, help="height and width of images, pixels")
@@ -143,6 +144,7 @@ def main() -> None:
         evaluations(
             meter,
             time.monotonic() + half,
+            tasks=given.tasks,
             slots=given.eval_slots,
             budget=given.eval_ticks,
             size=given.size,
