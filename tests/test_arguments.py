@@ -81,6 +81,14 @@ def test_a_state_of_other_scenes_is_refused_and_says_so(env: Any) -> None:
     assert told(env) == before
 
 
+def test_episodes_go_to_slots_in_the_order_they_are_named_in(env: Any) -> None:
+    before = env.placement.episode.tolist()
+    env.set_episodes(episodes=[7, 8], slots=[1, 0])
+    assert env.placement.episode.tolist() == [8, 7]
+    env.set_episodes(episodes=before)
+    env.reset()
+
+
 def test_a_placement_cannot_be_written_to_from_outside(env: Any) -> None:
     with pytest.raises(ValueError, match="read-only"):
         env.placement.task[0] = 1

@@ -160,8 +160,7 @@ class Verbs(RuleBasedStateMachine):
         if not chosen.any():
             return
         self.env.set_episodes(episodes=episodes, slots=chosen)
-        order = np.argsort(TWINS[chosen])
-        self.twin.set_episodes(episodes=episodes[order], slots=TWINS[chosen])
+        self.twin.set_episodes(episodes=episodes, slots=TWINS[chosen])
         self.waits |= chosen
         assert not self.env.done[chosen].any()
         assert (self.env.evaluate().num_steps[chosen] == 0).all()

@@ -121,8 +121,8 @@ class SlotBatch(ABC):
         Args:
             tasks: task of each slot, by index or name (B of them, or one for all); None keeps them.
             episodes: episode of each slot (B of them, or one for all); None keeps them.
-            slots: slots that ``tasks`` and ``episodes`` are for, bool [B] or indices; the other slots continue their
-                episodes. None: all of them. In LIBERO a slot's new task must share its scene.
+            slots: slots that ``tasks`` and ``episodes`` are for, bool [B] or indices in the same order; the other slots
+                continue their episodes. None: all of them. In LIBERO a slot's new task must share its scene.
 
         Raises:
             PlacementError, UnknownTask: something that does not exist, or a wrong number of them.
@@ -132,7 +132,7 @@ class SlotBatch(ABC):
         if slots is None:
             self._place(self._chosen(tasks, episodes))
             return
-        rows = self.slot_indices(slots)
+        rows = inputs.indices(slots, self.num_envs, PlacementError, as_given=True)
         if len(rows):
             self._replace(
                 rows, self._chosen(self._of_all(tasks, rows, "task"), self._of_all(episodes, rows, "episode"))

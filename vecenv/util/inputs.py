@@ -155,8 +155,8 @@ def bools(value: object, what: str, count_: int, error: type[Exception]) -> np.n
     return np.broadcast_to(found, count_).copy()
 
 
-def indices(slots: object, count_: int, error: type[Exception]) -> np.ndarray:
-    """Indices of slots, ascending, int [n], from bool [B], indices, or None for all.
+def indices(slots: object, count_: int, error: type[Exception], *, as_given: bool = False) -> np.ndarray:
+    """Indices of slots, int [n], ascending or in the order they were given, from bool [B], indices, or None for all.
 
     Raises:
         error: a mask of another length, a slot that does not exist or is named twice, or anything else.
@@ -176,4 +176,4 @@ def indices(slots: object, count_: int, error: type[Exception]) -> np.ndarray:
         raise error(f"slots={shown(slots)}: there are slots 0 to {count_ - 1}; expected {right}")
     if len(np.unique(rows)) < len(rows):
         raise error(f"slots={shown(slots)}: a slot is named twice")
-    return np.sort(rows).astype(int)
+    return (rows if as_given else np.sort(rows)).astype(int)
