@@ -46,7 +46,8 @@ DAMAGE = [cut, empty, flip, junk]
 
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "numba"))
+    settings: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
+    monkeypatch.setattr(settings, "CACHE_DIR", str(tmp_path / "numba"))
     path = tmp_path / "doubling.py"
     path.write_text(SOURCE)
     spec = importlib.util.spec_from_file_location("doubling", path)
