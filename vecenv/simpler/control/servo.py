@@ -48,7 +48,7 @@ class ServoConfig:
 
     def __post_init__(self) -> None:
         numbers = ("pos_tol", "rot_tol", "max_advance_pos", "max_advance_rot", "lead", "nearer")
-        counts = dict.fromkeys(("max_steps", "stuck_after"), (1, inputs.MOST_COUNT))
+        counts: dict[str, tuple[int, int]] = dict.fromkeys(("max_steps", "stuck_after"), (1, inputs.MOST_COUNT))
         configs.check(self, InvalidInput, positive=numbers, ranges=counts)
 
     @classmethod
