@@ -178,6 +178,7 @@ def test_a_look_that_was_not_exported_says_which_flags_add_it(folder: Path) -> N
 
 def test_a_folder_without_images_says_which_flags_add_them(copy: Path) -> None:
     shutil.rmtree(copy / "images")
+    write_seal(copy)
     with pytest.raises(ExportError, match=r"--images gl --lod fast`, where LIBERO's packages are installed"):
         drawn(copy)
     config = FunctionalConfig(impl="warp", obs=("pixels",), scenes=str(copy), budget=BUDGET)
