@@ -342,3 +342,13 @@ def test_bars_are_gone_when_the_command_ends_with_an_error() -> None:
     screen.failed("something", 1)
     text = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
     assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")  # the cursor is shown again
+
+
+def test_the_package_runs_as_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "vecenv", "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, importlib.metadata.version("vecenv"))
+    wrong = subprocess.run(
+        [sys.executable, "-m", "vecenv", "list", "nothing"], capture_output=True, text=True, check=False
+    )
+    assert wrong.returncode == 2
+    assert "unknown suite 'nothing'" in wrong.stderr

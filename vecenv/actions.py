@@ -20,9 +20,10 @@ frame, grip 1 closed and 0 open.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,9 +31,9 @@ import numpy.typing as npt
 from vecenv.contract import ACTION_DIM, EE_POSE_DIM
 from vecenv.controllers.waypoint import Pose, WaypointPlan
 from vecenv.errors import InvalidInput
+from vecenv.util import inputs
 
 _NO_LENGTH = 1e-6
-_MOST_STEPS = 2**31 - 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,19 +65,20 @@ class ActionError(InvalidInput):
     """An action has the wrong type or shape; the message states the given and the expected one."""
 
 
-def _array(value: object, what: str, right: str) -> np.ndarray:
+def _array(
+    value: object,
+    what: str,
+    right: str,
+    fits: Callable[[tuple[int, ...]], bool],
+    kinds: str = "iuf",
+) -> np.ndarray:
+    """A float64 array of one of the shapes that fit, from an array, nested lists or JSON text."""
     if isinstance(value, str):
         try:
             value = json.loads(value)
         except (ValueError, RecursionError) as error:
             raise ActionError(f"{what}: not JSON ({error}); expected {right}") from error
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ActionError(f"{what}: not numeric or ragged ({error}); expected {right}") from error
-    if array.dtype.kind not in "biuf":
-        raise ActionError(f"{what}: got {array.dtype} values, not numbers; expected {right}")
-    return array.astype(np.float64)
+    return inputs.floats(value, what, right, ActionError, kinds=kinds, fits=fits)
 
 
 def continuous(value: object, num_envs: int, limits: npt.ArrayLike = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -94,14 +96,15 @@ def continuous(value: object, num_envs: int, limits: npt.ArrayLike = 1.0) -> tup
         ActionError: the wrong shape or not numbers.
     """
     right = f"[{num_envs}, {ACTION_DIM}] or [{num_envs}, K, {ACTION_DIM}]"
-    array = _array(value, "actions", right)
-    shape = array.shape
-    if num_envs == 1 and array.shape == (ACTION_DIM,):
-        array = array[None]
-    if array.ndim == 2:
-        array = array[:, None]
-    if array.ndim != 3 or array.shape[0] != num_envs or array.shape[2] != ACTION_DIM:
-        raise ActionError(f"actions: got shape {shape}; expected {right}")
+
+    def fits(shape: tuple[int, ...]) -> bool:
+        if num_envs == 1 and shape == (ACTION_DIM,):
+            return True
+        return len(shape) in (2, 3) and (shape[0], shape[-1]) == (num_envs, ACTION_DIM)
+
+    array = _array(value, "actions", right, fits)
+    if array.ndim < 3:
+        array = array.reshape(num_envs, 1, ACTION_DIM)
     most = np.asarray(limits, float)
     sanitized = np.clip(np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0), -most, most)
     return sanitized, (sanitized != array).any(axis=(1, 2))
@@ -123,13 +126,14 @@ def ee_poses(value: object, num_envs: int) -> tuple[np.ndarray, np.ndarray, tupl
         ActionError: the wrong shape or not numbers.
     """
     right = f"[{num_envs}, {EE_POSE_DIM}] or an empty sequence"
-    array = _array([] if value is None else value, "poses", right)
+
+    def fits(shape: tuple[int, ...]) -> bool:
+        return shape == (num_envs, EE_POSE_DIM) or 0 in shape or (num_envs == 1 and shape == (EE_POSE_DIM,))
+
+    array = _array([] if value is None else value, "poses", right, fits)
     if array.size == 0:
         return np.zeros((num_envs, EE_POSE_DIM)), np.zeros(num_envs, bool), ("",) * num_envs
-    if num_envs == 1 and array.shape == (EE_POSE_DIM,):
-        array = array[None]
-    if array.shape != (num_envs, EE_POSE_DIM):
-        raise ActionError(f"poses: got shape {array.shape}; expected {right}")
+    array = array.reshape(num_envs, EE_POSE_DIM)
     finite = np.asarray(np.isfinite(array).all(axis=1))
     clean = np.where(np.isfinite(array), array, 0.0)
     largest = np.abs(clean[:, 3:7]).max(axis=1, keepdims=True)
@@ -146,19 +150,27 @@ def ee_poses(value: object, num_envs: int) -> tuple[np.ndarray, np.ndarray, tupl
 
 # Keys of an action of ``step_ee_pose`` that is a mapping.
 _EE_POSE_KEYS = ("pose", "hold_steps", "carry", "slots")
+# Attributes or keys of a plan of ``step_waypoints``.
+_PLAN_FIELDS = ("poses", "grip", "hold", "valid")
 
 
 def ee_pose_fields(value: object) -> Mapping[str, object]:
     """The arguments that an action of ``step_ee_pose`` gives: those of a mapping, or the poses alone.
 
     Raises:
-        ActionError: a mapping with another key.
+        ActionError: a mapping with another key, or without ``pose``.
     """
     if not isinstance(value, Mapping):
         return {"pose": value}
-    if unknown := [key for key in value if key not in _EE_POSE_KEYS]:
-        raise ActionError(f"poses: unknown key {unknown[0]!r}; expected {', '.join(_EE_POSE_KEYS)}")
+    _check_keys(value, "poses", _EE_POSE_KEYS)
+    if "pose" not in value:
+        raise ActionError(f"poses: a mapping without 'pose'; expected {', '.join(_EE_POSE_KEYS)}, all but it optional")
     return value
+
+
+def _check_keys(value: Mapping[Any, object], what: str, known: Sequence[str]) -> None:
+    if unknown := [key for key in value if key not in known]:
+        raise ActionError(f"{what}: unknown key {inputs.shown(unknown[0])}; expected {', '.join(known)}")
 
 
 def flags(value: object, num_envs: int, name: str) -> np.ndarray:
@@ -167,10 +179,7 @@ def flags(value: object, num_envs: int, name: str) -> np.ndarray:
     Raises:
         ActionError: anything else.
     """
-    array = np.asarray(value)
-    if array.dtype != bool or array.shape not in ((), (num_envs,)):
-        raise ActionError(f"{name}: got {value!r}; expected true or false, or {num_envs} of them")
-    return np.broadcast_to(array, num_envs).copy()
+    return inputs.bools(value, name, num_envs, ActionError)
 
 
 def plan(value: object, num_envs: int) -> tuple[WaypointPlan, tuple[str, ...]]:
@@ -178,18 +187,22 @@ def plan(value: object, num_envs: int) -> tuple[WaypointPlan, tuple[str, ...]]:
 
     Args:
         value: a plan with the attributes, or a mapping with the keys, ``poses`` [B, T, 7] (xyz, wxyz), ``grip`` [B, T],
-            ``hold`` [B, T] and ``valid`` [B, T].
+            ``hold`` [B, T] and ``valid`` [B, T], whose entries are bools, or 0 and 1.
         num_envs: B.
 
     Returns:
         The plan with unit quaternions, bad waypoints marked invalid; and what was wrong in each slot, B strings.
 
     Raises:
-        ActionError: the wrong shape or not numbers.
+        ActionError: the wrong shape or not numbers, or another key.
     """
+    if isinstance(value, Mapping):
+        _check_keys(value, "plan", _PLAN_FIELDS)
     poses = _plan_field(value, "poses", num_envs, (7,))
     shape = poses.shape[:2]
-    grip, hold, valid = (_plan_field(value, name, num_envs, (), shape[1]) for name in ("grip", "hold", "valid"))
+    grip, hold, valid = (_plan_field(value, name, num_envs, (), shape[1]) for name in _PLAN_FIELDS[1:])
+    if not np.isin(valid, (0, 1)).all():
+        raise ActionError("plan.valid: expected bools, or 0 and 1")
     rows = np.concatenate([poses, grip[..., None]], axis=-1).reshape(-1, EE_POSE_DIM)
     clean, usable, problems = ee_poses(rows, len(rows))
     clean, wanted = clean.reshape(*shape, EE_POSE_DIM), valid != 0
@@ -203,22 +216,24 @@ def plan(value: object, num_envs: int) -> tuple[WaypointPlan, tuple[str, ...]]:
 def _plan_field(value: object, name: str, num_envs: int, tail: tuple[int, ...], count: int | None = None) -> np.ndarray:
     found = value.get(name) if isinstance(value, Mapping) else getattr(value, name, None)
     right = f"[{', '.join(map(str, (num_envs, 'T' if count is None else count, *tail)))}]"
-    array = _array([] if found is None else found, f"plan.{name}", right)
-    fits = array.ndim == 2 + len(tail) and array.shape[0] == num_envs and array.shape[2:] == tail and array.shape[1] > 0
-    if not fits or count not in (None, array.shape[1]):
-        raise ActionError(f"plan.{name}: got shape {array.shape}; expected {right}")
-    return array
+
+    def fits(shape: tuple[int, ...]) -> bool:
+        whole = len(shape) == 2 + len(tail) and shape[0] == num_envs and shape[2:] == tail and shape[1] > 0
+        return whole and count in (None, shape[1])
+
+    kinds = "biuf" if name in ("grip", "valid") else "iuf"
+    return _array([] if found is None else found, f"plan.{name}", right, fits, kinds)
 
 
 def hold_steps(value: object, num_envs: int) -> np.ndarray:
-    """Validate ``hold_steps``: one non-negative integer, or one a slot; returns int [B].
+    """Validate ``hold_steps``: one non-negative whole number (2.0 is one), or one a slot; returns int [B].
 
     Raises:
         ActionError: anything else.
     """
     right = f"a non-negative integer or {num_envs} of them"
-    array = _array(value, "hold_steps", right)
-    whole = (array >= 0) & (array <= _MOST_STEPS) & (array == np.floor(array))
-    if array.shape not in ((), (num_envs,)) or not whole.all():
-        raise ActionError(f"hold_steps: got {value!r}; expected {right}")
+    array = _array(value, "hold_steps", right, lambda shape: shape in ((), (num_envs,)))
+    whole = (array >= 0) & (array <= inputs.MOST_COUNT) & (array == np.floor(array))
+    if not whole.all():
+        raise ActionError(f"hold_steps: got {inputs.shown(value)}; expected {right}")
     return np.broadcast_to(array.astype(int), num_envs).copy()

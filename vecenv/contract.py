@@ -10,7 +10,10 @@ Rules that hold for every environment:
 
 * ``reset`` is idempotent: live slots are not changed, finished ones start their episode again. ``set_episodes`` decides
   which episode a slot has, ``reset`` never does.
-* ``observe_*`` never advances a slot; on a finished slot it reads the terminal state.
+* ``observe_*`` never advances a slot and changes nothing; on a finished slot it reads the terminal state.
+* An argument that cannot be used is a ``vecenv.errors.VecenvError`` that says what would be right, and a call that
+  raises one has changed nothing. Integers are Python's or NumPy's, never bools; slots are bool [B] or indices; lists
+  may be generators, which are read once.
 * ``terminated`` means success, ``truncated`` means the step budget ran out (or the slot was quarantined). A finished
   slot ignores further steps: reward 0, flags kept.
 * What success means is an option. ``"first"``: an episode ends when its goal first holds. ``"final"``: it runs to

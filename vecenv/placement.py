@@ -10,11 +10,16 @@ import difflib
 import fnmatch
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
 import numpy as np
 
 from vecenv.errors import InvalidInput
+from vecenv.util import inputs
+
+_T = TypeVar("_T")
 
 
 class PlacementError(InvalidInput):
@@ -28,17 +33,30 @@ class SpecError(PlacementError):
 ALL = "all"
 # An error lists this many names and counts the rest.
 _LISTED = 12
-_RANGE = re.compile(r"(\d+)(?:\s*-\s*(\d+))?")
+# No index has more digits, and Python reads no number of thousands.
+_DIGITS = 18
+_RANGE = re.compile(rf"(\d{{1,{_DIGITS}}})(?:\s*-\s*(\d{{1,{_DIGITS}}}))?")
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Task and episode of each slot, int [B] each."""
+    """Task and episode of each slot, int [B] each; copies that cannot be written to.
+
+    Raises:
+        PlacementError: no slot, not as many episodes as tasks, or something else than indices.
+    """
 
     task: np.ndarray
     episode: np.ndarray
 
     def __post_init__(self) -> None:
+        for name in ("task", "episode"):
+            given = inputs.array(getattr(self, name), name, "indices, int [B]", PlacementError, kinds="iu")
+            if given.size and (int(given.min()) < 0 or int(given.max()) > inputs.MOST_COUNT):
+                raise PlacementError(f"{name}: expected indices, which are at least 0, int [B]")
+            own = given.astype(int)
+            own.flags.writeable = False
+            object.__setattr__(self, name, own)
         if self.task.shape != self.episode.shape or self.task.ndim != 1 or self.task.size == 0:
             raise PlacementError("a batch needs at least one slot, and as many episodes as tasks")
 
@@ -46,17 +64,13 @@ class Placement:
         return len(self.task)
 
 
-def _ints(value: object, what: str) -> list[int]:
-    try:
-        items = list(value) if isinstance(value, Iterable) and not isinstance(value, Mapping) else [value]
-    except TypeError:  # an array of no dimension
-        items = [value]
-    whole: list[int] = []
-    for item in items:
-        if isinstance(item, bool) or not isinstance(item, int | np.integer):
-            raise PlacementError(f"{what}: {item!r} is not an integer")
-        whole.append(int(item))
-    return whole
+def integers(value: object, what: str) -> list[int]:
+    """One index or several, in any list, range, array or generator.
+
+    Raises:
+        PlacementError: something that is no integer, or a mapping, set or text.
+    """
+    return inputs.integers(value, what, PlacementError)
 
 
 def _check(values: Iterable[int], count: int, what: str) -> None:
@@ -96,7 +110,7 @@ def parse_episodes(spec: str, num_episodes: int, every: int | None = None) -> tu
     text = spec.strip()
     if text == ALL:
         return tuple(range(num_episodes if every is None else every))
-    if not text.isdecimal():
+    if not text.isdecimal() or len(text) > _DIGITS:
         return _parse_indices(text, num_episodes, "episode")
     if not 1 <= int(text) <= num_episodes:
         raise SpecError(f"{text} episodes asked for: each task has {num_episodes}, ask for 1 to {num_episodes}")
@@ -111,13 +125,15 @@ def episode_indices(episodes: object, num_episodes: int, every: int | None = Non
     """
     if episodes is None or isinstance(episodes, str):
         return parse_episodes(ALL if episodes is None else episodes, num_episodes, every)
-    if isinstance(episodes, int | np.integer) and not isinstance(episodes, bool):
-        count = f", or '{episodes}' for the first {episodes}" if episodes > 0 else ""
+    if isinstance(episodes, np.ndarray) and not episodes.ndim:
+        episodes = episodes.item()
+    if inputs.is_integer(episodes):
+        count = f", or '{episodes}' for the first {episodes}" if int(cast(int, episodes)) > 0 else ""
         raise SpecError(
             f"episodes={episodes}: a bare number used to mean one episode here and a count in `vecenv eval`; "
             f"write [{episodes}] for episode {episodes} alone{count}"
         )
-    chosen = _ints(episodes, "episode")
+    chosen = integers(episodes, "episode")
     _check(chosen, num_episodes, "episode")
     return tuple(chosen)
 
@@ -131,8 +147,13 @@ def task_indices(tasks: object, names: Sequence[str]) -> tuple[int, ...]:
     if tasks is None or isinstance(tasks, str):
         return parse_tasks(ALL if tasks is None else tasks, len(names), names)
     chosen: list[int] = []
-    for task in [tasks] if isinstance(tasks, Mapping) else tasks if isinstance(tasks, Iterable) else [tasks]:
-        chosen += parse_tasks(task, len(names), names) if isinstance(task, str) else _ints(task, "task")
+    for task in inputs.items(tasks, "task", PlacementError):
+        if isinstance(task, str):
+            chosen += parse_tasks(task, len(names), names)
+        elif inputs.is_integer(task):
+            chosen.append(int(task))
+        else:
+            raise PlacementError(f"task: {inputs.shown(task)} is not an integer or a name")
     _check(chosen, len(names), "task")
     return tuple(chosen)
 
@@ -144,16 +165,17 @@ def cross(
 
     Args:
         tasks: one index or several.
-        episodes: for all tasks, as for ``episode_indices``; or a mapping task -> episodes.
+        episodes: for all tasks, as for ``episode_indices``; or a mapping task -> episodes, none where it has no key.
         num_tasks: number of tasks.
         num_episodes: number of episodes of every task, or a mapping task -> number; tasks left out have none.
         every: number of episodes of ``"all"``, if a protocol has fewer.
 
     Raises:
-        PlacementError: an index that does not exist, or nothing to place.
+        PlacementError: an index that does not exist, episodes of a task that is not among them, or nothing to place.
     """
-    task_list = _ints(tasks, "task")
+    task_list = integers(tasks, "task")
     _check(task_list, num_tasks, "task")
+    episodes = each_read_once(episodes, task_list)
     pairs: list[tuple[int, int]] = []
     for task in task_list:
         spec = episodes.get(task, ()) if isinstance(episodes, Mapping) else episodes
@@ -163,6 +185,22 @@ def cross(
         raise PlacementError("no slot to fill: tasks or episodes are empty")
     columns = np.array(pairs)
     return Placement(columns[:, 0], columns[:, 1])
+
+
+def each_read_once(episodes: object, tasks: Sequence[int]) -> object:
+    """Episodes that may be read for one task after the other: generators as lists, also in a mapping.
+
+    Raises:
+        PlacementError: a mapping with a key that is none of the tasks.
+    """
+    if not isinstance(episodes, Mapping):
+        return inputs.read_once(episodes)
+    for task in episodes:
+        if not inputs.is_integer(task) or task not in tasks:
+            raise PlacementError(
+                f"episodes: {inputs.shown(task)} is none of the tasks, {', '.join(map(str, _some(sorted(set(tasks)))))}"
+            )
+    return {int(task): inputs.read_once(chosen) for task, chosen in episodes.items()}
 
 
 def each(tasks: object, episodes: object, current: Placement, *, num_tasks: int, num_episodes: int) -> Placement:
@@ -179,7 +217,9 @@ def each(tasks: object, episodes: object, current: Placement, *, num_tasks: int,
         if value is None:
             columns.append(kept)
             continue
-        chosen = _ints(value, what)
+        if isinstance(value, AbstractSet) and len(value) > 1:
+            raise PlacementError(f"{what}: {inputs.shown(value)} is a set, which has no order; expected a list")
+        chosen = integers(value, what)
         _check(chosen, count, what)
         if len(chosen) not in (1, len(current)):
             raise PlacementError(
@@ -233,14 +273,16 @@ def _named(part: str, what: str, names: Sequence[str]) -> int:
         raise SpecError(f"{what} {part!r} fits {len(fitting)}: {', '.join(_some(fitting))}; write more of the name")
     near = difflib.get_close_matches(part, names, n=3) or list(names)
     close = f"; did you mean {', '.join(_some(near))}?" if near else ""
-    raise SpecError(f"cannot read {part!r} as {what}s: write indices and ranges such as 0,3,5-7, or 'all'{close}")
+    raise SpecError(
+        f"cannot read {inputs.shown(part)} as {what}s: write indices and ranges such as 0,3,5-7, or 'all'{close}"
+    )
 
 
 def _plain(name: str) -> str:
     return "_".join(name.lower().split())
 
 
-def _some(names: Sequence[str]) -> Iterator[str]:
+def _some(names: Sequence[_T]) -> Iterator[_T | str]:
     yield from names[:_LISTED]
     if len(names) > _LISTED:
         yield f"... ({len(names) - _LISTED} more)"

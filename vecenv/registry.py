@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol, cast
 
 from vecenv.errors import InvalidInput, MissingDependency
+from vecenv.util.names import shown
 
 if TYPE_CHECKING:
     from vecenv.contract import BatchEnv
@@ -74,7 +75,13 @@ class Family(Protocol):
 
 
 def family_name(suite: str) -> str:
-    """Which benchmark a suite belongs to by its name: ``"simpler"`` for ``simpler/...``, else ``"libero"``."""
+    """Which benchmark a suite belongs to by its name: ``"simpler"`` for ``simpler/...``, else ``"libero"``.
+
+    Raises:
+        OptionError: the name is no text.
+    """
+    if not isinstance(suite, str):
+        raise OptionError(f"suite={shown(suite)}: expected the name of a suite, such as 'libero_goal'")
     prefix = suite.split("/")[0]
     return prefix if prefix in FAMILIES else _WITHOUT_PREFIX
 
@@ -85,8 +92,8 @@ def family(name: str) -> Family:
     Raises:
         OptionError: there is no such family.
     """
-    if name not in FAMILIES:
-        raise OptionError(f"family={name!r}: expected one of {', '.join(FAMILIES)}, or None for all suites")
+    if not isinstance(name, str) or name not in FAMILIES:
+        raise OptionError(f"family={shown(name)}: expected one of {', '.join(FAMILIES)}, or None for all suites")
     return cast(Family, importlib.import_module(FAMILIES[name]))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, Self, SupportsIndex, TypeVar
 
@@ -17,14 +17,18 @@ import numpy as np
 import numpy.typing as npt
 
 from vecenv import actions as action_space
+from vecenv import placement as placing
 from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo, Timings, Watcher
 from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.placement import Placement, PlacementError
+from vecenv.util import inputs
 
 _Kind = TypeVar("_Kind", bound=Control)
 _Result = TypeVar("_Result")
 # Tasks that ``repr`` names before it only counts them.
 _LISTED = 8
+# Where a batch is before it is placed.
+_NOWHERE = Placement(np.zeros(1, int), np.zeros(1, int))
 
 
 class SlotBatch(ABC):
@@ -45,6 +49,7 @@ class SlotBatch(ABC):
         self._closed = False
         self._process = os.getpid()
         self._watchers: list[Watcher] = []
+        self._placement = _NOWHERE
         self._physics_s = 0.0
 
     # -- supplied by the simulator -------------------------------------------------------------------------------------
@@ -55,11 +60,11 @@ class SlotBatch(ABC):
 
     @abstractmethod
     def _prepare(self) -> np.ndarray:
-        """Get ready for ``_placement``; returns the step budget of each slot, int [B]."""
+        """Get ready for ``_placement``, or raise and change nothing; returns the step budget of each slot, int [B]."""
 
     @abstractmethod
     def _arm(self, stale: np.ndarray) -> None:
-        """Put the slots ``stale`` (bool [B]) at the start of their episodes."""
+        """Put the slots ``stale`` (bool [B]) at the start of their episodes, or raise and change nothing."""
 
     @abstractmethod
     def _instruction(self, slot: int) -> str:
@@ -116,8 +121,8 @@ class SlotBatch(ABC):
         Args:
             tasks: task of each slot, by index or name (B of them, or one for all); None keeps them.
             episodes: episode of each slot (B of them, or one for all); None keeps them.
-            slots: slots that ``tasks`` and ``episodes`` are for, bool [B] or indices; the other slots continue their
-                episodes. None: all of them. In LIBERO a slot's new task must share its scene.
+            slots: slots that ``tasks`` and ``episodes`` are for, bool [B] or indices in the same order; the other slots
+                continue their episodes. None: all of them. In LIBERO a slot's new task must share its scene.
 
         Raises:
             PlacementError, UnknownTask: something that does not exist, or a wrong number of them.
@@ -127,7 +132,7 @@ class SlotBatch(ABC):
         if slots is None:
             self._place(self._chosen(tasks, episodes))
             return
-        rows = self.slot_indices(slots)
+        rows = inputs.indices(slots, self.num_envs, PlacementError, as_given=True)
         if len(rows):
             self._replace(
                 rows, self._chosen(self._of_all(tasks, rows, "task"), self._of_all(episodes, rows, "episode"))
@@ -139,51 +144,49 @@ class SlotBatch(ABC):
         Raises:
             PlacementError: a mask of another length, or a slot that does not exist.
         """
-        if slots is None:
-            return np.arange(self.num_envs)
-        given = np.asarray(slots)
-        if given.dtype == bool:
-            if given.shape != (self.num_envs,):
-                raise PlacementError(f"slots: a mask of shape {list(given.shape)}; expected [{self.num_envs}]")
-            return np.flatnonzero(given)
-        rows = np.atleast_1d(given)
-        if rows.ndim != 1 or (rows.size and not np.issubdtype(rows.dtype, np.integer)):
-            raise PlacementError(f"slots={slots!r}: expected bool [{self.num_envs}] or indices")
-        if rows.size and (rows.min() < 0 or rows.max() >= self.num_envs):
-            raise PlacementError(f"slots={slots!r}: there are slots 0 to {self.num_envs - 1}")
-        if len(np.unique(rows)) < len(rows):
-            raise PlacementError(f"slots={slots!r}: a slot is named twice")
-        return np.sort(rows).astype(int)
+        return inputs.indices(slots, self.num_envs, PlacementError)
+
+    def _task_indices(self, tasks: object) -> Sequence[int]:
+        """Tasks as ``set_episodes`` takes them, as indices."""
+        return placing.integers(tasks, "task")
 
     def _of_all(self, given: object, rows: np.ndarray, what: str) -> object:
         """A value for each of B slots: ``given`` for the slots ``rows``, the current one for the others."""
         if given is None:
             return None
-        values = list(given) if isinstance(given, Iterable) and not isinstance(given, str) else [given] * len(rows)
+        values = list(self._task_indices(given) if what == "task" else placing.integers(given, what))
+        values = values * len(rows) if len(values) == 1 else values
         if len(values) != len(rows):
-            raise PlacementError(f"{len(values)} {what}s for {len(rows)} slots")
-        merged: list[Any] = getattr(self._placement, what).tolist()
+            raise PlacementError(f"{len(values)} {what}s for {len(rows)} slots; expected one a slot, or a single one")
+        merged: list[int] = getattr(self._placement, what).tolist()
         for row, value in zip(rows.tolist(), values, strict=True):
             merged[row] = value
         return merged
 
     def _replace(self, rows: np.ndarray, placement: Placement) -> None:
         """Place other episodes in some slots; the others keep their state."""
+        with self._placed_at(placement):
+            self._max_steps[rows] = self._prepare_slots(rows)
+        self._live[rows] = False
+        self._clear(rows)
+
+    @contextmanager
+    def _placed_at(self, placement: Placement) -> Iterator[None]:
+        """Inside, ``placement`` is the batch's; afterwards too, unless something was raised."""
         before, self._placement = self._placement, placement
         try:
-            self._max_steps[rows] = self._prepare_slots(rows)
-        except Exception:
+            yield
+        except BaseException:
             self._placement = before
             raise
-        self._live[rows] = False
 
     def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:
-        """Prepare the new episodes of some slots; returns their step budgets, int [n]."""
+        """Prepare the new episodes of some slots, or raise and change nothing; returns their budgets, int [n]."""
         raise self._error("this environment cannot place single slots: leave slots out")
 
     def _place(self, placement: Placement) -> None:
-        self._placement = placement
-        self._max_steps = self._prepare()
+        with self._placed_at(placement):
+            self._max_steps = self._prepare()
         b = self.num_envs
         self._live = np.zeros(b, bool)
         self._terminated = np.zeros(b, bool)
@@ -220,10 +223,7 @@ class SlotBatch(ABC):
         return self._delivered(info)
 
     def _begin(self, stale: np.ndarray) -> None:
-        for array in (self._terminated, self._truncated, self._success, self._solved, self._steps, self._reward):
-            array[stale] = 0
-        for slot in np.flatnonzero(stale):
-            self._fault[slot] = ""
+        self._clear(np.flatnonzero(stale))
         self._live |= stale
         self._quarantine(stale)
 
@@ -231,6 +231,13 @@ class SlotBatch(ABC):
         """Poses of the end effectors, xyz (metres) and wxyz, world frame, [B, 7], a copy."""
         self._check_live()
         return self._tools()
+
+    def _clear(self, rows: np.ndarray) -> None:
+        """No tick, reward, verdict or fault in some slots."""
+        for array in (self._terminated, self._truncated, self._success, self._solved, self._steps, self._reward):
+            array[rows] = 0
+        for slot in rows.tolist():
+            self._fault[slot] = ""
 
     def end_episodes(self, slots: Any) -> None:
         """End the episodes of some slots: truncated, they ignore further steps and cost nothing until ``reset``.
@@ -339,13 +346,15 @@ class SlotBatch(ABC):
             plan: anything with ``poses`` [B, T, 7] (xyz in metres, wxyz, world frame), ``grip`` [B, T] (1 closed, 0
                 open), ``hold`` int [B, T] (ticks without motion in place of the drive; 0 drives) and ``valid``
                 bool [B, T] (the others are skipped).
-            max_misses: None for no limit.
+            max_misses: at least 1; None for no limit.
 
         Raises:
-            ActionError: not numbers, or another shape.
+            ActionError: not numbers, another shape, or another key.
         """
         self._check_live()
         checked, errors = action_space.plan(plan, self.num_envs)
+        if max_misses is not None:
+            max_misses = inputs.count(max_misses, "max_misses", action_space.ActionError, least=1)
         before = self._steps.copy()
         with self._stepping():
             reward, arrived, ticks = self._follow(checked, max_misses)
@@ -386,7 +395,12 @@ class SlotBatch(ABC):
         """While inside, ``watcher(actions [B, 7], active bool [B])`` is called before every tick of an episode.
 
         It is called for every stepping method, ``step_ee_pose`` included; settling is not part of an episode.
+
+        Raises:
+            ValueError: a subclass; something that cannot be called.
         """
+        if not callable(watcher):
+            raise self._error(f"watched({inputs.shown(watcher)}): expected a function of actions and active slots")
         self._watchers.append(watcher)
         try:
             yield

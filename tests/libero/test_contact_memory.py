@@ -13,6 +13,7 @@ from vecenv.libero.physics import budgets
 from vecenv.libero.physics.budgets import Budget
 from vecenv.libero.scene import goals
 from vecenv.libero.tasks.export import BUDGETS, ExportError, ExportFolder, export
+from vecenv.libero.tasks.seal import write_seal
 
 BUDGET = Budget(contacts=7, rows=21, pairs=3, candidates=5, share=4)
 
@@ -41,6 +42,7 @@ def test_what_was_exported_is_not_measured_again(folder: Path, monkeypatch: pyte
     assert budget(folder) == BUDGET
     assert export_budgets(folder) == 1  # nor when the folder is brought up to date
     (folder / BUDGETS).unlink()
+    write_seal(folder)
     with pytest.raises(AssertionError, match="measured"):
         budget(folder)
 
@@ -50,5 +52,8 @@ def test_damaged_budgets_are_named(folder: Path, text: str) -> None:
     (key,) = json.loads((folder / BUDGETS).read_text())
     numbers = '"rows": 1, "pairs": 1, "candidates": 1'
     (folder / BUDGETS).write_text(text.replace("KEY", key).replace("-1}", f"-1, {numbers}}}"))
+    with pytest.raises(ExportError, match=r"budgets.json: damaged"):
+        budget(folder)
+    write_seal(folder)
     with pytest.raises(ExportError, match=r"budgets.json: damaged"):
         budget(folder)

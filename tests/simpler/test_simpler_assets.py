@@ -10,6 +10,7 @@ import tarfile
 import threading
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import httpx
@@ -18,8 +19,8 @@ from support.asset_server import CAN, FILES, Server, write
 from support.simpler_files import ARCHIVE
 from typer.testing import CliRunner
 
+from vecenv.simpler.assets import archives, pull
 from vecenv.simpler.assets import files as assets
-from vecenv.simpler.assets import pull
 from vecenv.simpler.assets.download import RetryPolicy, check_redirect
 from vecenv.simpler.assets.errors import FileNotInSource
 from vecenv.simpler.assets.files import Entry, Manifest, ManifestError, read_manifest, resolve
@@ -134,6 +135,72 @@ def test_a_lasting_fault_leaves_no_file_and_says_why(trick: str, reason: str, se
     with pytest.raises(AssertionError, match=reason):
         raise AssertionError(report.missing[PurePosixPath(CAN)])
     assert len(server.ranges(CAN)) == QUICK.attempts
+
+
+def test_a_server_that_drips_is_given_up(server: Server, root: Path) -> None:
+    """Fifty bytes a second would take the can's file ten minutes, and no single byte is late."""
+    server.always[CAN] = "drip"
+    policy = replace(QUICK, attempts=2, slowest=2000.0, patience=0.3)
+    report = pull.pull(root, server.url, manifest=listed(FILES), retry=policy)
+    assert "more slowly than 2000 bytes a second" in report.missing[PurePosixPath(CAN)]
+    first, second = server.ranges(CAN)
+    assert first is None
+    assert second is not None  # what came is kept and continued
+
+
+@pytest.mark.parametrize("name", ["", " "])
+def test_an_empty_source_is_refused_and_nothing_is_asked_for(
+    name: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def network(*_: object) -> None:
+        raise AssertionError("the network was asked")
+
+    monkeypatch.setattr(pull, "make_client", network)
+    with pytest.raises(PullError, match="expected a folder, an archive or a web address"):
+        pull.pull(root, name, manifest=listed(FILES))
+    assert not root.exists()
+    for option in ("--from", "--to"):
+        done = CliRunner().invoke(assets_app, ["pull", "simpler", option, name])
+        assert done.exit_code == 2
+        assert "is empty" in done.output
+
+
+@pytest.mark.parametrize("name", ["lock", "part", "copy", "folder"])
+def test_links_among_partial_downloads_are_not_followed(name: str, server: Server, root: Path, tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "file").write_bytes(b"mine")
+    key = hashlib.sha256(FILES[CAN]).hexdigest()
+    if name == "folder":
+        root.mkdir()
+        (root / ".partial").symlink_to(victim)
+    else:
+        (root / ".partial").mkdir(parents=True)
+        (root / ".partial" / ("lock" if name == "lock" else f"{key}.{name}")).symlink_to(victim / "file")
+    with pytest.raises(PullError, match=r"link|symbolic"):
+        pulled(root, server)
+    assert (victim / "file").read_bytes() == b"mine"
+    assert [path.name for path in victim.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("kind", ["gz", "xz", "bz2"])
+def test_an_archive_that_decompresses_to_endless_zeros_is_refused(
+    kind: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archives, "_FREE", 1 << 20)
+    (tmp_path / "a.tar").write_bytes(tarred({"zeros": bytes(1 << 24)}, kind))
+    with pytest.raises(PullError, match="decompresses to more than"):
+        pull.pull(root, str(tmp_path / "a.tar"), manifest=listed(FILES))
+
+
+def test_an_archive_of_more_files_than_any_is_refused(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archives, "MAX_ENTRIES", 2)
+    for name, content in (("a.zip", zipped(FILES)), ("a.tar", tarred(FILES, ""))):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(PullError, match="more than 2 entries"):
+            pull.pull(root, str(tmp_path / name), manifest=listed(FILES))
 
 
 def test_a_missing_file_is_asked_for_once(server: Server, root: Path) -> None:

@@ -80,7 +80,14 @@ class Handler(BaseHTTPRequestHandler):
             self._head(206, len(rest), **{"Content-Range": f"bytes {7 if trick == 'elsewhere' else begin}-9/9"})
         else:
             self._head(200, len(rest))
-        if trick in ("truncate", "stall"):
+        if trick == "drip":
+            for byte in rest:
+                if self.server.over.wait(0.02):
+                    break
+                self.wfile.write(bytes([byte]))
+                self.wfile.flush()
+            self.close_connection = True
+        elif trick in ("truncate", "stall"):
             self.wfile.write(rest[: len(rest) // 2])
             self.wfile.flush()
             if trick == "stall":

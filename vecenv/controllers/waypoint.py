@@ -27,8 +27,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Real
 
 from vecenv.controllers.osc import OSC_POSE, OscConfig
+from vecenv.errors import InvalidInput
+from vecenv.util import configs, inputs
 from vecenv.util.arrays import AnyArray
 from vecenv.util.rotations import quat_mul, quat_normalize, require_tail, rotation_between, rotvec_to_quat, safe_norm
+
+_SERVO_NUMBERS = ("pos_tol", "rot_tol", "max_advance_pos", "max_advance_rot", "max_lead_pos", "max_lead_rot")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +56,9 @@ class WaypointConfig:
     max_advance_rot: float = 0.05
     max_lead_pos: float = 0.025
     max_lead_rot: float = 0.25
+
+    def __post_init__(self) -> None:
+        configs.check(self, InvalidInput, positive=_SERVO_NUMBERS, ranges={"max_steps": (1, inputs.MOST_COUNT)})
 
 
 STEP_EE_POSE = WaypointConfig()

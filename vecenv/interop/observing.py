@@ -103,8 +103,8 @@ class Observer:
         assert isinstance(self._env, LiberoEnv)
         out = np.zeros((self._env.num_envs, self._width))
         for group in self._env.physics.groups:
-            group.refresh_kinematics()
-            seen = _object_poses(group)
+            with group.refreshed():
+                seen = _object_poses(group)
             out[group.slots, : seen.shape[1]] = seen
         return out
 

@@ -19,7 +19,7 @@ from vecenv.libero.render.options import RenderConfig
 from vecenv.libero.scene.contacts import CONTACTS, Contacts
 from vecenv.libero.scene.lean.geometry import PROFILES
 from vecenv.protocols import DEFAULT, LIBERO, ResetLoop, protocol, reset_loop
-from vecenv.util import configs
+from vecenv.util import configs, inputs
 
 
 class LiberoError(InvalidInput):
@@ -27,6 +27,14 @@ class LiberoError(InvalidInput):
 
 
 ARRAYS = ("numpy", "jax")
+# The least and the largest value of counts, and of the seed.
+_RANGES = {
+    "settle_steps": (0, inputs.MOST_COUNT),
+    "max_steps": (1, inputs.MOST_COUNT),
+    "num_threads": (1, 4096),
+    "num_devices": (1, 4096),
+    "seed": (0, 2**64 - 1),
+}
 # Options that have no default of their own.
 _DECIDED_BY_PROTOCOL = ("start", "success")
 
@@ -119,6 +127,7 @@ class LiberoConfig:
     waypoint: waypoint.WaypointConfig = field(default_factory=waypoint.WaypointConfig)
 
     def __post_init__(self) -> None:
+        configs.check(self, LiberoError, ranges=_RANGES)
         protocol(self.protocol, LIBERO)
         for name, allowed in (
             ("backend", BACKENDS),
@@ -137,10 +146,10 @@ class LiberoConfig:
             object.__setattr__(self, "reset_loop", reset_loop(self.reset_loop))
         if isinstance(self.render, Mapping):
             configs.build(RenderConfig, self.render, what="render", error=LiberoError)
-        for name, least in (("settle_steps", 0), ("max_steps", 1), ("num_threads", 1), ("num_devices", 1)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise LiberoError(f"{name}={value}: need at least {least}")
+        if self.backend == "native" and self.num_devices != 1:
+            raise LiberoError(
+                f"num_devices={self.num_devices}: for the backends of MJX; 'native' runs on CPU threads, num_threads"
+            )
 
     def rules(self, suite: str) -> EpisodeRules:
         """What is given here, and for the rest what the protocol says of a suite.

@@ -7,6 +7,7 @@ their start states, goals and instructions, which are data. Read ``vecenv/contra
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, cast
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv import protocols
+from vecenv.arguments import check_points, checked_state
 from vecenv.contract import Control, State
 from vecenv.controllers import waypoint
 from vecenv.libero import contact_memory, observe, starts
@@ -40,8 +42,6 @@ from vecenv.slots import SlotBatch
 from vecenv.util.transfers import put
 
 _Result = TypeVar("_Result")
-# Arrays of ``State`` that ``set_state`` takes.
-_STATE = ("qpos", "qvel", "time")
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,21 @@ class LiberoEnv(SlotBatch):
         self._cameras = self._rig(self._rules.render)
         # Another one for images of another size, made when they are first asked for.
         self._resized: CameraRig | None = None
-        self._place(placement)
+        try:
+            self._place(placement)
+        except BaseException:
+            self.close()
+            raise
 
     # -- placement and lifecycle ---------------------------------------------------------------------------------------
 
     def _chosen(self, tasks: object, episodes: object) -> placing.Placement:
         counts = {"num_tasks": len(self._sources), "num_episodes": NUM_EPISODES}
-        indices = None if tasks is None else placing.task_indices(tasks, [source.name for source in self._sources])
+        indices = None if tasks is None else self._task_indices(tasks)
         return placing.each(indices, episodes, self._placement, **counts)
+
+    def _task_indices(self, tasks: object) -> Sequence[int]:
+        return placing.task_indices(tasks, [source.name for source in self._sources])
 
     def _prepare(self) -> np.ndarray:
         """Scenes, physics and goal tables for the current placement; physics that still fits is reused."""
@@ -98,17 +105,16 @@ class LiberoEnv(SlotBatch):
         every = {index: source.problem() for index, source in enumerate(self._sources)}
         problems = {index: problem for index, problem in every.items() if problem.scene_key() in keys}
         scenes = [self._scene(key, problems, self.config.geometry) for key in keys]
-        fixture_poses.check_names(self._rules.fixtures, scenes)
-        self._tasks = {
+        fixture_poses.check(self._rules.fixtures, scenes, self.num_envs)
+        if self.config.cameras is not None:  # a camera that does not exist is refused before anything runs
+            self._cameras.names([scene.model for scene in scenes])
+        tasks = {
             i: _TaskData(self._sources[i], problem, keys.index(problem.scene_key())) for i, problem in problems.items()
         }
-        # Where the servo's references ended; NaN where there is none to carry on from.
-        self._references = np.full((self.num_envs, 7), np.nan)
-        scene_of_slot = np.array([self._tasks[int(task)].scene for task in self._placement.task])
-        self._scene_of_slot = scene_of_slot
-        if self._physics is None or not self._physics.serves(scenes, scene_of_slot):
-            self._close_physics()
-            self._physics = make_physics(
+        scene_of_slot = np.array([tasks[int(task)].scene for task in self._placement.task])
+        physics = self._physics
+        if physics is None or not physics.serves(scenes, scene_of_slot):
+            physics = make_physics(
                 scenes,
                 scene_of_slot,
                 backend=self.config.backend,
@@ -118,9 +124,20 @@ class LiberoEnv(SlotBatch):
                 deterministic=self.config.deterministic,
                 budgets=[self._budget_of(key, scene) for key, scene in zip(keys, scenes, strict=True)],
             )
-        self._physics.set_goals([self._goal_table(group) for group in self._physics.groups])
-        if self.config.cameras is not None:
-            self._cameras.names(self.mj_models)  # a camera that does not exist is refused before anything runs
+        try:
+            tables = [self._goal_table(group, tasks) for group in physics.groups]
+        except BaseException:
+            if physics is not self._physics:
+                physics.close()
+            raise
+        # Nothing above has changed the batch, nothing below fails.
+        if physics is not self._physics:
+            self._close_physics()
+            self._physics = physics
+        physics.set_goals(tables)
+        self._tasks, self._scene_of_slot = tasks, scene_of_slot
+        # Where the servo's references ended; NaN where there is none to carry on from.
+        self._references = np.full((self.num_envs, 7), np.nan)
         return np.full(self.num_envs, self._rules.max_steps)
 
     def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:
@@ -131,7 +148,7 @@ class LiberoEnv(SlotBatch):
                     f"{self.suite} task {task} ({self._sources[task].name}) is in another scene than slot {row}: "
                     "while other slots continue, a slot changes to tasks of its own scene only"
                 )
-        self.physics.set_goals([self._goal_table(group) for group in self.physics.groups])
+        self.physics.set_goals([self._goal_table(group, self._tasks) for group in self.physics.groups])
         return np.full(len(rows), self._rules.max_steps)
 
     def _scene(self, key: SceneKey, problems: Mapping[int, Problem], geometry: str) -> Scene:
@@ -157,11 +174,11 @@ class LiberoEnv(SlotBatch):
             return self.config.budget
         return contact_memory.measured_budget(scene, contact_memory.sharing(self._sources, scene_key))
 
-    def _goal_table(self, group: Group) -> goals.GoalTable:
-        tasks = self._placement.task[group.slots]
-        present = [task for task, data in self._tasks.items() if data.scene == self._tasks[int(tasks[0])].scene]
-        rows = [present.index(int(task)) for task in tasks]
-        return goals.build_table([self._tasks[task].problem for task in present], group.scene, rows)
+    def _goal_table(self, group: Group, tasks: Mapping[int, _TaskData]) -> goals.GoalTable:
+        chosen = self._placement.task[group.slots]
+        present = [task for task, data in tasks.items() if data.scene == tasks[int(chosen[0])].scene]
+        rows = [present.index(int(task)) for task in chosen]
+        return goals.build_table([tasks[task].problem for task in present], group.scene, rows)
 
     def _instruction(self, slot: int) -> str:
         return self._tasks[int(self._placement.task[slot])].source.instruction
@@ -170,12 +187,15 @@ class LiberoEnv(SlotBatch):
         return str(task)
 
     def _arm(self, stale: np.ndarray) -> None:
-        self._references[stale] = np.nan
+        jobs: list[tuple[Group, np.ndarray, Start]] = []  # made before the first is used: making one may fail
         for group in self.physics.groups:
             for task in np.unique(self._placement.task[group.slots]):
                 slots = group.slots[(self._placement.task[group.slots] == task) & stale[group.slots]]
                 if len(slots):
-                    self.physics.place(group, slots, self._start(group.scene, int(task), slots))
+                    jobs.append((group, slots, self._start(group.scene, int(task), slots)))
+        self._references[stale] = np.nan
+        for group, slots, start in jobs:
+            self.physics.place(group, slots, start)
         settle = np.tile(SETTLE_ACTION, (self.num_envs, 1))
         for _ in range(self._rules.settle_steps if self._rules.start == "raw" else 0):
             self.physics.control_step(settle, stale)
@@ -348,6 +368,7 @@ class LiberoEnv(SlotBatch):
             ExportError: lean scenes come from a folder that has no exact ones.
         """
         self._check_live()
+        check_points(points, LiberoError)
         problems = [self._tasks[int(task)].problem for task in self._placement.task]
         return observe.objects(
             self.physics.groups, self._exact_scene, problems, self._fault, points, self.slot_indices(slots)
@@ -356,9 +377,10 @@ class LiberoEnv(SlotBatch):
     def check_success(self) -> np.ndarray:
         """Whether each slot's goal holds in its present state, bool [B]; unlike ``evaluate`` not tied to a tick."""
         self._check_live()
-        for group in self.physics.groups:
-            group.refresh_all()
-        return self.physics.judge()
+        with contextlib.ExitStack() as refreshed:
+            for group in self.physics.groups:
+                refreshed.enter_context(group.refreshed(contacts=True))
+            return self.physics.judge()
 
     # -- physics state -------------------------------------------------------------------------------------------------
 
@@ -404,10 +426,10 @@ class LiberoEnv(SlotBatch):
 
     def state(self) -> State:
         """Physics state of every slot, a copy."""
-        return self._delivered(self._state())
-
-    def _state(self) -> State:
         self._check_live()
+        return self._delivered(self._state_now())
+
+    def _state_now(self) -> State:
         groups = self.physics.groups
         nq, nv = np.zeros(self.num_envs, int), np.zeros(self.num_envs, int)
         qpos = np.zeros((self.num_envs, max(group.scene.model.nq for group in groups)))
@@ -434,22 +456,13 @@ class LiberoEnv(SlotBatch):
             qpos: [B, >= nq]. qvel: [B, >= nv]. time: seconds, [B].
 
         Raises:
-            LiberoError: a wrong shape, or a number that is not finite.
+            LiberoError: a wrong type or shape, a number that is not finite, or the state of other scenes.
         """
         self._check_live()
-        current = self._state()
-        given = {"qpos": qpos, "qvel": qvel, "time": time} if state is None else vars(state)
-        arrays = {name: getattr(current, name) if given[name] is None else given[name] for name in _STATE}
-        chosen = State(
-            **{name: np.asarray(array, float) for name, array in arrays.items()}, nq=current.nq, nv=current.nv
-        )
-        for name in _STATE:
-            have, need = getattr(chosen, name).shape, getattr(current, name).shape
-            if len(have) != len(need) or have[0] != need[0] or have[1:] < need[1:]:
-                raise LiberoError(f"set_state: {name} has shape {have}; expected {need}")
-            bad = ~np.isfinite(getattr(chosen, name)).reshape(self.num_envs, -1).all(axis=1)
-            if bad.any():
-                raise LiberoError(f"set_state: {name} of slot {int(bad.argmax())} is not finite")
+        given = {"qpos": qpos, "qvel": qvel, "time": time}
+        if state is not None and any(array is not None for array in given.values()):
+            raise LiberoError("set_state: give a state, or the arrays one by one")
+        chosen = checked_state(state, given, self._state_now(), LiberoError)
         for group in self.physics.groups:
             model, slots = group.scene.model, group.slots
             qpos, qvel = chosen.qpos[slots, : model.nq], chosen.qvel[slots, : model.nv]

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from vecenv.libero.config import LiberoError
 from vecenv.libero.physics.base import Group, Physics
 from vecenv.libero.robot import BASE_BODY
 from vecenv.libero.scene import surface
@@ -56,32 +55,27 @@ def objects(
     """Ground truth of every slot.
 
     Args:
-        groups: the slots by scene; their kinematics are refreshed.
+        groups: the slots by scene; none of what they hold is changed.
         exact_scene: a group's scene with upstream's collision geoms, on which parts are measured.
         problems: the problem of each slot, B.
         faults: why the physics of each slot failed, "" where it did not, B; a failed slot has no snapshot.
         points: ``"surface"`` or ``"aabb"``, see ``LiberoEnv.observe_objects``.
         slots: indices of the slots to observe; the others have no snapshot.
-
-    Raises:
-        LiberoError: other ``points``.
     """
-    if points not in ("surface", "aabb"):
-        raise LiberoError(f"points={points!r}: expected 'surface' or 'aabb'")
     snapshots: list[ObjectsSnapshot | None] = [None] * len(problems)
     wanted = np.isin(np.arange(len(problems)), slots)
     for group in groups:
         rows = np.flatnonzero(wanted[group.slots])
         if not len(rows):
             continue
-        group.refresh_kinematics()
         samples = _Clouds.of(group.scene, exact_scene(group))
-        clouds, parts = samples.world(group, rows, points), samples.parts_in_world(group, rows)
-        for index, row in enumerate(rows.tolist()):
-            slot = int(group.slots[row])
-            if not faults[slot]:
-                seen = {name: (pos[index], normal[index]) for name, (pos, normal) in clouds.items()}
-                snapshots[slot] = _snapshot(group, row, problems[slot], seen, parts[index])
+        with group.refreshed():
+            clouds, parts = samples.world(group, rows, points), samples.parts_in_world(group, rows)
+            for index, row in enumerate(rows.tolist()):
+                slot = int(group.slots[row])
+                if not faults[slot]:
+                    seen = {name: (pos[index], normal[index]) for name, (pos, normal) in clouds.items()}
+                    snapshots[slot] = _snapshot(group, row, problems[slot], seen, parts[index])
     return Objects(
         snapshot=tuple(snapshots), error=tuple(f"physics failed: {reason}" if reason else "" for reason in faults)
     )

@@ -46,7 +46,7 @@ def start_of(
         keys: (seed, suite, task, episode) of each slot, what sampled fixture poses depend on.
 
     Raises:
-        StoredStartsError: the stored states do not fit the scene.
+        StoredStartsError: the stored states do not fit the scene, or one is not finite.
         FixtureError, ResetError, SettlingError: the fixture poses cannot be had, or things do not come to rest.
     """
     problem = source.problem()
@@ -56,6 +56,9 @@ def start_of(
         raise StoredStartsError(
             f"starts of {qpos.shape[1]} + {qvel.shape[1]} numbers, but the scene has {nq} positions and {nv} velocities"
         )
+    bad = ~(np.isfinite(qpos[episodes]).all(axis=1) & np.isfinite(qvel[episodes]).all(axis=1))
+    if bad.any():
+        raise StoredStartsError(f"the start of episode {int(episodes[bad.argmax()])} is not finite")
     bodies, pos, quat = fixtures.poses(
         problem, scene, rules.fixtures, keys=keys, slots=slots.tolist(), loop=rules.reset_loop
     )

@@ -25,7 +25,7 @@ def pull_command(
     source: str | None = typer.Option(
         None, "--from", metavar="DIR|URL", help="The only folder, archive or web address to take them from."
     ),
-    to: Path | None = typer.Option(
+    to: str | None = typer.Option(
         None, "--to", metavar="DIR", help=f"Folder to fill; by default {VARIABLE} or the user's data folder."
     ),
 ) -> None:
@@ -39,12 +39,15 @@ def pull_command(
         raise typer.Exit(1) from None
     if what not in _SETS:
         raise typer.BadParameter(f"{what!r}; known: {', '.join(_SETS)}", param_hint="WHAT")
+    for value, hint in ((source, "--from"), (to, "--to")):
+        if value is not None and not value.strip():
+            raise typer.BadParameter(f"{value!r} is empty", param_hint=hint)
     manifest = _SETS[what]
     try:
         with Progress(transient=True, disable=not sys.stderr.isatty()) as bars:
             bar = bars.add_task(what)
             report = pull.pull(
-                to or default_root(),
+                default_root() if to is None else Path(to).expanduser(),
                 source,
                 manifest=read_manifest(manifest) if manifest else None,
                 progress=lambda done, total: bars.update(bar, completed=done, total=total),

@@ -15,6 +15,7 @@ from vecenv.protocols import protocol as find_protocol
 from vecenv.simpler.control.servo import ServoConfig
 from vecenv.simpler.published.lists import SEED, check_protocol
 from vecenv.simpler.variants import Variant, make_variant
+from vecenv.util import configs, inputs
 
 BACKENDS = ("physx_cpu",)
 # Name of the default CPU physics in all suites.
@@ -72,6 +73,7 @@ class SimplerConfig:
     assets: str | Path | None = None
 
     def __post_init__(self) -> None:
+        configs.check(self, SimplerError, ranges={"num_threads": (1, 4096), "max_steps": (1, inputs.MOST_COUNT)})
         if self.backend == "physx_cuda":
             raise SimplerError(_NO_CUDA)
         if self.backend == _NATIVE:
@@ -89,10 +91,6 @@ class SimplerConfig:
         object.__setattr__(self, "variant", make_variant(self.variant))
         if check_protocol(self.protocol) != SEED and self.variant is not None:
             raise SimplerError(f"variant={self.variant}: protocol {self.protocol!r} already decides the variants")
-        for name in ("num_threads", "max_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise SimplerError(f"{name}={value}: need at least 1, or None")
 
     @property
     def success_mode(self) -> str:

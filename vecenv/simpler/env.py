@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from vecenv import actions as action_space
 from vecenv import placement as placing
+from vecenv.arguments import check_points, checked_state
 from vecenv.contract import Control, State
 from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.observations import Egocentric, Objects, Rendered
@@ -42,6 +43,7 @@ from vecenv.simpler.tasks import find_task, list_tasks
 from vecenv.simpler.variants import make_variant, varied
 from vecenv.simpler.workers import Job, Sizes, Slots, make_slots
 from vecenv.slots import SlotBatch
+from vecenv.util import inputs
 
 # Largest action: metres, radians, gripper.
 ACTION_LIMITS = np.array([1.0, 1.0, 1.0, np.pi / 2, np.pi / 2, np.pi / 2, 1.0])
@@ -81,7 +83,11 @@ class SimplerEnv(SlotBatch):
         self._drawing_s = 0.0
         self._prepared: dict[tuple[int, int], Episode] = {}
         self._camera_poses = CameraPoses(self.robot, self._root)
-        self._place(placement)
+        try:
+            self._place(placement)
+        except BaseException:
+            self.close()
+            raise
 
     def _sizes(self) -> Sizes:
         robot = self.robot
@@ -98,6 +104,9 @@ class SimplerEnv(SlotBatch):
         placement = placing.each(task_indices(self.suite, tasks), episodes, self._placement, **limits)
         return check_placement(self.config.protocol, self.suite, placement)
 
+    def _task_indices(self, tasks: object) -> Sequence[int]:
+        return placing.integers(task_indices(self.suite, tasks), "task")
+
     def _prepare(self) -> np.ndarray:
         """Episodes and verdicts for the current placement."""
         self._episodes = [self._episode(*self._key(slot)) for slot in range(self.num_envs)]
@@ -106,10 +115,11 @@ class SimplerEnv(SlotBatch):
         return np.array([self.config.max_steps or each.task.max_steps for each in self._episodes])
 
     def _prepare_slots(self, rows: np.ndarray) -> np.ndarray:
-        for row in rows.tolist():
-            self._episodes[row] = self._episode(*self._key(row))
+        chosen = {row: self._episode(*self._key(row)) for row in rows.tolist()}
+        for row, episode in chosen.items():
+            self._episodes[row] = episode
             self._judges[row], self._verdicts[row] = None, Verdict(False)
-        return np.array([self.config.max_steps or self._episodes[row].task.max_steps for row in rows.tolist()])
+        return np.array([self.config.max_steps or episode.task.max_steps for episode in chosen.values()])
 
     def _episode(self, task: int, episode: int) -> Episode:
         key = (task, episode)
@@ -146,9 +156,13 @@ class SimplerEnv(SlotBatch):
         return judge is not None and judge.second_half(int(self._steps[slot]) + 1)
 
     def advance_subtask(self, slots: npt.ArrayLike | None = None) -> None:
-        """Begin the second half in slots (bool [B], all by default) of tasks that have two."""
-        chosen = np.ones(self.num_envs, bool) if slots is None else np.asarray(slots, bool)
-        for slot in np.flatnonzero(chosen):
+        """Begin the second half in slots (bool [B] or indices, all by default) of tasks that have two.
+
+        Raises:
+            PlacementError: a mask of another length, or a slot that does not exist.
+        """
+        self._check_live()
+        for slot in self.slot_indices(slots).tolist():
             judge = self._judges[slot]
             if judge is not None:
                 judge.advance()
@@ -315,8 +329,7 @@ class SimplerEnv(SlotBatch):
             SimplerError: another value.
         """
         self._check_live()
-        if points not in ("surface", "aabb"):
-            raise SimplerError(f"points={points!r}: expected 'surface' or 'aabb'")
+        check_points(points, SimplerError)
         wanted = np.isin(np.arange(self.num_envs), self.slot_indices(slots))
         rows = zip(wanted, self._episodes, self._facts, self._fault, strict=True)
         return Objects(
@@ -375,21 +388,16 @@ class SimplerEnv(SlotBatch):
         """Overwrite the physics state of every slot; step counts, verdicts and the controllers' memory stay.
 
         Args:
-            state: what ``state()`` returned, of the same placement.
+            state: what ``state()`` returned, of the same placement; its ``time`` is that of the step counts, and stays.
 
         Raises:
-            SimplerError: a wrong shape, or a number that is not finite.
+            SimplerError: a wrong type or shape, a number that is not finite, or the state of another placement.
         """
         self._check_live()
-        current = self.state()
-        for name in ("qpos", "qvel"):
-            have, need = np.asarray(getattr(state, name)), getattr(current, name)
-            if have.shape != need.shape:
-                raise SimplerError(f"set_state: {name} has shape {have.shape}; expected {need.shape}")
-            bad = ~np.isfinite(have).all(axis=1)
-            if bad.any():
-                raise SimplerError(f"set_state: {name} of slot {int(bad.argmax())} is not finite")
-        self.slots.restore({slot: self._joined(slot, state) for slot in range(self.num_envs)})
+        if state is None:
+            raise SimplerError("set_state: expected what state() returned, a vecenv.contract.State")
+        chosen = checked_state(state, {}, self.state(), SimplerError, exactly=True)
+        self.slots.restore({slot: self._joined(slot, chosen) for slot in range(self.num_envs)})
         self._quarantine(np.ones(self.num_envs, bool))
 
     def _joined(self, slot: int, state: State) -> np.ndarray:
@@ -404,13 +412,10 @@ class SimplerEnv(SlotBatch):
 
 def task_indices(suite: str, tasks: object) -> object:
     """Indices of tasks given by name, index, or several of either; None stays None."""
-    if tasks is None or isinstance(tasks, Mapping):
-        return tasks
-    if isinstance(tasks, str):
-        return find_task(suite, tasks).index
-    if isinstance(tasks, Sequence):
-        return [find_task(suite, task).index if isinstance(task, str) else task for task in tasks]
-    return tasks
+    if tasks is None:
+        return None
+    listed = inputs.items(tasks, "task", placing.PlacementError)
+    return [find_task(suite, task).index if isinstance(task, str) else task for task in listed]
 
 
 def make(

@@ -8,7 +8,12 @@ function alone, so keep the functions it calls (``part``) in the same file.
 
 from __future__ import annotations
 
+import contextlib
+import glob
+import hashlib
+import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numba
@@ -16,10 +21,13 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.base import BaseContext
+from numba.core.caching import FunctionCache
 from numba.core.types import IntegerLiteral, Type
 from numba.core.typing.context import Context as TypingContext
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
+
+from vecenv.util import caching
 
 # What an intrinsic returns: its signature, and the function that generates its code.
 Intrinsic: TypeAlias = tuple[Signature, Callable[..., Any]]
@@ -49,9 +57,74 @@ def compile_for_c(signature: Signature, function: Callable[..., Any]) -> Any:
 
 def _cached(compiler: Callable[..., Any], signature: Signature | list[Signature], function: Callable[..., Any]) -> Any:
     try:
-        return compiler(signature, cache=True, **OPTIONS)(function)
+        cache = FunctionCache(function)
     except RuntimeError:  # numba finds no folder that it may write
         return compiler(signature, **OPTIONS)(function)
+    files = CachedFiles(Path(cache.cache_path), cache._impl.filename_base)
+    compile_it = compiler(signature, cache=True, **OPTIONS)
+    files.remove_unsound()
+    try:
+        compiled = compile_it(function)
+    except Exception as error:  # whatever reading a damaged pickle raises; what is wrong with the function comes again
+        files.remove(f"{type(error).__name__}: {error}")
+        compiled = compiler(signature, cache=True, **OPTIONS)(function)
+    files.seal()
+    return compiled
+
+
+class CachedFiles:
+    """What numba cached of a function, with a file beside it that has the checksums.
+
+    Numba runs whatever machine code its files hold, and does not notice when they were changed.
+
+    Args:
+        folder: numba's folder.
+        base: how the files of the function begin.
+    """
+
+    def __init__(self, folder: Path, base: str) -> None:
+        self._folder, self._base = folder, base
+        self._seal = folder / f"{base}.sha256"
+
+    def remove_unsound(self) -> None:
+        """Remove the files unless they are those that were sealed, with a warning if they were changed since."""
+        try:
+            sealed = json.loads(self._seal.read_bytes())
+        except FileNotFoundError:
+            sealed = None  # nothing was cached yet, or not by this version
+        except (OSError, ValueError, RecursionError):
+            sealed = {}
+        try:
+            present = self._digests()
+        except OSError as error:
+            self.remove(str(error))
+            return
+        if sealed is None:
+            self._unlink()
+        elif present != sealed:
+            self.remove("its checksum is another")
+
+    def remove(self, why: str) -> None:
+        """Remove the files and say why."""
+        caching.damaged(self._folder / f"{self._base}.nbi", why)
+        self._unlink()
+
+    def seal(self) -> None:
+        """Write the checksums; a folder that cannot be written is no error."""
+        with contextlib.suppress(OSError):
+            caching.write_file(self._seal, json.dumps(self._digests()).encode())
+
+    def _paths(self) -> list[Path]:
+        start = glob.escape(self._base)
+        return sorted([*self._folder.glob(f"{start}.nbi"), *self._folder.glob(f"{start}.*.nbc")])
+
+    def _digests(self) -> dict[str, str]:
+        return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in self._paths()}
+
+    def _unlink(self) -> None:
+        for path in (*self._paths(), self._seal):
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 @intrinsic_with_literals

@@ -8,15 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import dacite
 import numpy as np
+from dacite.types import is_instance
+
+from vecenv.util import inputs
 
 _T = TypeVar("_T")
-# Module names before the names of types in dacite's messages.
+# Characters of a message of dacite, which shows the whole value; module names before the names of types in it.
+_LONGEST = 500
 _MODULES = re.compile(r"\b(?:[a-z_]+\.)+(?=[A-Z])")
 
 
@@ -37,7 +42,7 @@ def build(
     if unknown:
         close = difflib.get_close_matches(unknown[0], known, n=1)
         hint = f"; did you mean {close[0]}?" if close else ""
-        given = ", ".join(f"{name}={fields[name]!r}" for name in unknown)
+        given = ", ".join(f"{name}={inputs.shown(fields[name])}" for name in unknown)
         raise error(f"{what} has no option {given}{hint}; its own: {', '.join(known)}")
     hints = get_type_hints(kind)
     plain = {name: _plain(name, value, hints[name], what, error) for name, value in fields.items()}
@@ -45,7 +50,16 @@ def build(
     try:
         return dacite.from_dict(kind, {**start, **plain}, dacite.Config(strict=True))
     except dacite.DaciteError as problem:
-        raise error(f"{what}: {_MODULES.sub('', str(problem))}") from problem
+        raise error(f"{what}: {_said(problem)}") from problem
+
+
+def _said(problem: dacite.DaciteError) -> str:
+    """The message of one of dacite's errors without module names; of a value that shows itself badly, its field."""
+    try:
+        said = _MODULES.sub("", str(problem))
+    except Exception:
+        said = f'wrong value type for field "{getattr(problem, "field_path", "")}"'
+    return said if len(said) <= _LONGEST else said[:_LONGEST] + " ..."
 
 
 def field_names(kind: type) -> tuple[str, ...]:
@@ -58,8 +72,56 @@ def _plain(name: str, value: object, hint: object, what: str, error: type[Except
     if isinstance(value, np.generic):
         value = value.item()
     choices = get_args(hint) if get_origin(hint) is Literal else ()
-    if choices and value not in choices:
-        raise error(f"{what}: {name}={value!r} is not available; available: {', '.join(map(str, choices))}")
+    if choices and not (isinstance(value, str) and value in choices):
+        given = inputs.shown(value)
+        raise error(f"{what}: {name}={given} is not available; available: {', '.join(map(str, choices))}")
     if isinstance(value, bool) and "bool" not in str(hint) and "Any" not in str(hint):
         raise error(f"{what}: {name}={value!r}: expected {getattr(hint, '__name__', hint)}, not a bool")
     return value
+
+
+def vector(value: object, what: str, error: type[Exception]) -> tuple[float, float, float]:
+    """Three finite numbers as a tuple; raises ``error`` where they are none."""
+    right = "three finite numbers"
+    found = inputs.floats(value, what, right, error, fits=lambda shape: shape == (3,))
+    if not np.isfinite(found).all():
+        raise error(f"{what}: expected {right}")
+    x, y, z = found.tolist()
+    return x, y, z
+
+
+def check(
+    instance: object,
+    error: type[Exception],
+    *,
+    positive: Sequence[str] = (),
+    vectors: Sequence[str] = (),
+    ranges: Mapping[str, tuple[int, int]] | None = None,
+) -> None:
+    """Check the fields of a frozen dataclass, in its ``__post_init__``; NumPy scalars become Python's.
+
+    Args:
+        instance: the dataclass.
+        error: raised for a field of a wrong type, for a number that is not finite, and for what the others say.
+        positive: fields that are greater than 0.
+        vectors: fields of three numbers, which become tuples.
+        ranges: by field, the least and the largest integer; None is left to the field's type.
+    """
+    kind = type(instance)
+    what, hints = kind.__name__, get_type_hints(kind)
+    for name in field_names(kind):
+        given = getattr(instance, name)
+        value = vector(given, f"{what}: {name}", error) if name in vectors else given
+        value = _plain(name, value, hints[name], what, error)
+        if not is_instance(value, hints[name]):
+            expected = _MODULES.sub("", str(getattr(hints[name], "__name__", "") or hints[name]))
+            raise error(f"{what}: {name}={inputs.shown(value)}: expected {expected}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise error(f"{what}: {name}={value}: expected a finite number")
+        if name in positive and value is not None and not value > 0:  # type: ignore[operator]
+            raise error(f"{what}: {name}={value}: expected a number greater than 0")
+        least, most = (ranges or {}).get(name, (None, None))
+        if least is not None and most is not None and value is not None and not least <= value <= most:  # type: ignore[operator]
+            raise error(f"{what}: {name}={inputs.shown(value)}: need at least {least}, at most {most}")
+        if value is not given:
+            object.__setattr__(instance, name, value)

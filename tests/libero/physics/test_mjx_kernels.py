@@ -132,8 +132,20 @@ def test_what_is_compiled_is_said(tmp_path: Path) -> None:
         kernels.compile_kernels(counting, threads=2)
         assert all(kernels.is_cached(each) for each in counting)
         kernels.compile_kernels([])
+    damaged, *others = [kernels._file(each) for each in counting]
+    damaged.write_bytes(damaged.read_bytes()[:-100])
+    fresh = [each._replace(module=_unloaded(each.module)) for each in counting]
+    assert [kernels.is_cached(each) for each in fresh] == [False, True, True]
+    assert not damaged.exists()
+    assert all(path.exists() for path in others)
     assert said[0] == "compiling 3 kernels of MuJoCo Warp, 2 at once (0 are cached)"
     assert said[-1].startswith("compiled 3 kernels in ")
+
+
+def _unloaded(module: Any) -> Any:
+    """A module as another process sees it: in the cache, and not loaded."""
+    module.unload()
+    return module
 
 
 def _module(name: str, number: int) -> Any:

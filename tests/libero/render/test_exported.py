@@ -28,6 +28,7 @@ from vecenv.libero.render.packing import PackingError, Pieces
 from vecenv.libero.render.sources import InstalledVisuals
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.tasks.export import ExportError, ExportFolder, export
+from vecenv.libero.tasks.seal import write_seal
 from vecenv.libero.tasks.suites import list_tasks
 
 SUITE = "libero_goal"  # its ten tasks share one scene
@@ -177,6 +178,7 @@ def test_a_look_that_was_not_exported_says_which_flags_add_it(folder: Path) -> N
 
 def test_a_folder_without_images_says_which_flags_add_them(copy: Path) -> None:
     shutil.rmtree(copy / "images")
+    write_seal(copy)
     with pytest.raises(ExportError, match=r"--images gl --lod fast`, where LIBERO's packages are installed"):
         drawn(copy)
     config = FunctionalConfig(impl="warp", obs=("pixels",), scenes=str(copy), budget=BUDGET)
@@ -222,6 +224,9 @@ DAMAGES: list[tuple[Callable[[Path], None], str]] = [
 @pytest.mark.parametrize(("damage", "says"), DAMAGES)
 def test_damage_is_found_and_named(copy: Path, damage: Callable[[Path], None], says: str) -> None:
     damage(copy)
+    with pytest.raises(ExportError, match=r"images/.*; run `vecenv compile --out .*again"):
+        ExportedVisuals(copy).scene(the_problem(), level="fast", colors="published")
+    write_seal(copy)  # what was sealed damaged is found as well
     with pytest.raises(ExportError, match=rf"{says}.*; run `vecenv compile --out .*again"):
         ExportedVisuals(copy).scene(the_problem(), level="fast", colors="published")
 

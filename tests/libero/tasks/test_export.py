@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -24,6 +26,7 @@ from vecenv.libero.scene import goals
 from vecenv.libero.tasks import settled
 from vecenv.libero.tasks import suites as suite_list
 from vecenv.libero.tasks.export import ExportError, ExportFolder, export
+from vecenv.libero.tasks.seal import write_seal
 
 SUITES = ("libero_goal", "libero_goal_task", "libero_10")
 # Two scenes of libero_10; one of the tasks of libero_goal's single scene.
@@ -78,6 +81,7 @@ def copy(exported: Path, tmp_path: Path) -> Path:
         if path.parent.name != "scenes" or path.stem in scenes:
             (folder / path.relative_to(exported)).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(path, folder / path.relative_to(exported))
+    write_seal(folder)
     return folder
 
 
@@ -201,10 +205,10 @@ UNUSABLE = [
     (edit_index(mujoco="3.16.1"), r"exported with MuJoCo 3\.16\.1, running .*; run `vecenv compile --out .*` again"),
     (edit_index(format=0), r"in layout 0, this vecenv reads layout \d+; run `vecenv compile --out .*` again"),
     (edit_index(suites={}), r"holds no suite 'libero_goal'; it holds none"),
-    (lambda folder: (folder / "starts" / "libero_goal.npz").unlink(), r"libero_goal\.npz: cannot be read: No such"),
+    (lambda folder: (folder / "starts" / "libero_goal.npz").unlink(), r"libero_goal\.npz: not a part of the export"),
     (cut_the_starts, r"libero_goal\.npz: damaged: .*; run `vecenv compile"),
     (swap_the_starts, r"libero_goal\.npz: damaged: .*; run `vecenv compile"),
-    (lambda folder: the_scene(folder).unlink(), r"\.mjb: cannot be read: No such file .*; run `vecenv compile"),
+    (lambda folder: the_scene(folder).unlink(), r"\.mjb: not a part of the export .*; run `vecenv compile"),
     (cut_the_scene, r"\.mjb: damaged: .*; run `vecenv compile"),
 ]
 
@@ -215,8 +219,67 @@ def test_a_folder_that_cannot_be_used_says_which_file_and_what_to_do(
 ) -> None:
     make(copy).reset()
     damage(copy)
+    with pytest.raises(
+        ExportError, match=r"(index|seal)\.json|copy.*(missing|damaged|holds|no such|exported with|in layout)"
+    ):
+        make(copy).reset()
+    if copy.is_dir():
+        write_seal(copy)  # what was sealed damaged is found as well
     with pytest.raises(ExportError, match=says):
         make(copy).reset()
+
+
+def flip(path: Path, where: float = 0.5) -> None:
+    data = bytearray(path.read_bytes())
+    data[int(where * (len(data) - 1))] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def test_every_file_of_an_export_is_sealed(copy: Path) -> None:
+    """One bit of any file, a file too many and a file too few are refused, and the file is named."""
+    names = [path.relative_to(copy).as_posix() for path in copy.rglob("*") if path.is_file()]
+    assert len(names) >= 6
+    for name in names:
+        good = (copy / name).read_bytes()
+        flip(copy / name)
+        if name != "starts/libero_10.npz" and name != "starts/libero_goal_task.npz":  # read by their own suites
+            with pytest.raises(ExportError, match=re.escape(name)):
+                make(copy).reset()
+        (copy / name).write_bytes(good[:-1])
+        with pytest.raises(ExportError, match=re.escape(name)):
+            make(copy)
+        (copy / name).unlink()
+        with pytest.raises(ExportError, match=re.escape(name)):
+            make(copy)
+        (copy / name).write_bytes(good)
+    for name in ("notes.txt", "starts/other.npz", f"scenes/{'0' * 64}.mjb", "images/index.json"):
+        (copy / name).parent.mkdir(exist_ok=True)
+        (copy / name).write_text("{}")
+        with pytest.raises(ExportError, match=rf"{re.escape(name)}: not a part of the export"):
+            make(copy)
+        (copy / name).unlink()
+    make(copy).reset()
+
+
+@pytest.mark.parametrize(("name", "value"), [("qpos_0", np.nan), ("qvel_0", np.inf), ("raw_0", -np.inf)])
+def test_starts_that_are_not_finite_are_refused(copy: Path, name: str, value: float) -> None:
+    path, index_path = copy / "starts" / "libero_goal.npz", copy / "index.json"
+    with np.load(path) as file:
+        arrays = {each: file[each] for each in file.files}
+    arrays[name][3, 9] = value
+    np.savez_compressed(path, **arrays)
+    index = json.loads(index_path.read_text())
+    index["suites"]["libero_goal"]["starts"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    index_path.write_text(json.dumps(index))
+    write_seal(copy)
+    with pytest.raises(ExportError, match=rf"libero_goal\.npz: damaged: {name} of episode 3 is not finite"):
+        make(copy, start="raw" if name == "raw_0" else "settled").reset()
+
+
+def test_an_export_that_was_interrupted_is_no_export(copy: Path) -> None:
+    (copy / "seal.json").unlink()
+    with pytest.raises(ExportError, match=r"seal\.json: missing: the export was interrupted.*; run `vecenv compile"):
+        make(copy)
 
 
 def test_a_suite_that_was_not_exported_names_those_that_were(exported: Path) -> None:

@@ -16,7 +16,7 @@ from vecenv.libero.scene.arenas import ARENAS
 from vecenv.libero.scene.bddl import Problem, load_problem
 from vecenv.libero.scene.scene import Scene, compile_scene
 from vecenv.libero.tasks import fixtures
-from vecenv.libero.tasks.fixtures import FixtureError, check_names, placements, poses
+from vecenv.libero.tasks.fixtures import FixtureError, check, placements, poses
 
 SCENE = "libero_goal-0"
 KEY = (0, "libero_goal", 0, 0)
@@ -195,17 +195,17 @@ def test_unknown_modes_are_refused(mode: Any) -> None:
     with pytest.raises(FixtureError, match="expected 'center', 'sampled', 'upstream' or a mapping"):
         stand(mode)
     with pytest.raises(FixtureError, match="expected 'center', 'sampled', 'upstream' or a mapping"):
-        check_names(mode, [scene_of(SCENE)[1]])
+        check(mode, [scene_of(SCENE)[1]], 1)
 
 
 def test_names_that_no_scene_has_are_refused() -> None:
     scene = scene_of(SCENE)[1]
-    check_names("center", [scene])
-    check_names({scene.fixtures[0].name: ()}, [scene])
+    check("center", [scene], 1)
+    check({scene.fixtures[0].name: ([0, 0, 0], [1, 0, 0, 0])}, [scene], 1)
     with pytest.raises(FixtureError, match=rf"'teapot_1'.*{scene.fixtures[0].name}"):
-        check_names({"teapot_1": ()}, [scene])
+        check({"teapot_1": ()}, [scene], 1)
     with pytest.raises(FixtureError, match=scene.objects[0].name):
-        check_names({scene.objects[0].name: ()}, [scene])
+        check({scene.objects[0].name: ()}, [scene], 1)
 
 
 def test_a_region_without_a_rectangle_holds_no_fixture() -> None:

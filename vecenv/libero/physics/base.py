@@ -11,6 +11,7 @@ import dataclasses
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
@@ -157,6 +158,14 @@ class Group(Protocol):
 
     def refresh_all(self) -> None:
         """Compute kinematics, contacts and contact sensors of the current state."""
+        ...
+
+    def refreshed(self, *, contacts: bool = False) -> AbstractContextManager[None]:
+        """Inside, kinematics (and contacts) are those of the current state; afterwards all is as it was.
+
+        After a control step they are those that goals are judged on, and a servo that starts reads them: to observe
+        must not change what happens next.
+        """
         ...
 
 

@@ -26,7 +26,7 @@ from vecenv.errors import InvalidInput
 from vecenv.libero.physics.base import Group, Start
 from vecenv.libero.scene.elements import CONTACT_LIMIT, PAIR_LIMIT
 from vecenv.libero.scene.scene import Scene
-from vecenv.util import caching
+from vecenv.util import caching, configs, inputs
 
 log = logging.getLogger(__name__)
 # Factors on the measured maxima. Two boxes have up to eight published contacts, and the number changes from substep to
@@ -70,9 +70,8 @@ class Budget:
     share: int | None = None
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if value is not None and value < 1:
-                raise BudgetError(f"{name}={value}: need at least 1")
+        counts = dict.fromkeys(configs.field_names(type(self)), (1, inputs.MOST_COUNT))
+        configs.check(self, BudgetError, ranges=counts)
 
     def warp_sizes(self, num_worlds: int) -> dict[str, int]:
         """Arguments for ``mjx.make_data(impl="warp")``."""
@@ -155,14 +154,18 @@ def cached(scene: Scene, starts: Start) -> Budget:
     folder = caching.folder("budgets")
     if folder is None:
         return measure(scene, starts)
-    path = folder / f"{key_of(scene, starts)}.json"
-    with contextlib.suppress(OSError, ValueError, TypeError):
-        return Budget(**json.loads(path.read_bytes()))
+    path = folder / f"{key_of(scene, starts)}.budget"
+    data = caching.unsealed(path)
+    if data is not None:
+        try:
+            return Budget(**json.loads(data))
+        except (ValueError, TypeError, RecursionError):
+            caching.damaged(path, "not a budget")
     log.info("measuring the contact memory of a scene on native MuJoCo, %d worlds", len(starts.qpos))
     budget = measure(scene, starts)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        caching.write_file(path, json.dumps(asdict(budget)).encode())
+        caching.write_file(path, caching.sealed(json.dumps(asdict(budget)).encode()))
     return budget
 
 

@@ -19,9 +19,10 @@ when follows robosuite 1.4.0:
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeAlias, TypeVar
 
@@ -53,6 +54,8 @@ _FAULTS = {
     mujoco.mjtWarning.mjWARN_BADCTRL: "non-finite control",
 }
 
+# Fields that are computed of the state.
+_REFRESHED = ("xpos", "xquat", "xmat", "site_xpos", "site_xmat", "sensordata")
 # Gripper targets after a quarter of a second of the action -1.
 _OPEN = (1.0, -1.0)
 
@@ -121,12 +124,17 @@ class _Block:
         self._qpos, self._qvel, self._time = bind("qpos"), bind("qvel"), bind("time")
         self._xquat, self._site_xpos = bind("xquat"), bind("site_xpos")
         self._controllers = Controllers(arm_views(scene, self.batch), home[0])
-        self._copies: list[tuple[np.ndarray, np.ndarray]] = []
+        self._copies: list[tuple[str, np.ndarray, np.ndarray]] = []
         self._errors: dict[int, str] = {}
 
     def copy_to(self, field: str, target: np.ndarray) -> None:
-        """Copy a MuJoCo field to ``target``, [n, ...], at the end of every call."""
-        self._copies.append((self.batch.bind(field), target))
+        """Copy a MuJoCo field to ``target``, [n, ...], at the end of every call: the rows that the call computed."""
+        self._copies.append((field, self.batch.bind(field), target))
+
+    def held(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Arrays that ``refresh`` changes and later calls read, each with its content now."""
+        copies = [target for name, _, target in self._copies if name in _REFRESHED]
+        return [(array, array.copy()) for array in (self.batch.bind("qacc_warmstart"), *copies)]
 
     def place(self, rows: np.ndarray, start: Start) -> None:
         """Set the simulations ``rows`` to their start states."""
@@ -155,7 +163,7 @@ class _Block:
     def refresh(self, stage: int, rows: _Rows = None) -> None:
         """Compute the current state up to a stage and copy the fields."""
         self._guarded(self.batch.forward, rows, stage=stage)
-        self._copy_fields()
+        self._copy_fields(rows)
 
     def control_step(self, actions: np.ndarray, active: np.ndarray) -> None:
         """25 substeps of the active rows, bool [n], with their actions [n, 7]."""
@@ -169,7 +177,7 @@ class _Block:
                 self._observe_pose(rows)
             elif substep == OBSERVED_FINGERS:
                 self._observe_fingers(rows)
-        self._copy_fields()
+        self._copy_fields(rows)
 
     def faults(self) -> list[tuple[int, str]]:
         """Rows in which MuJoCo raised or warned since their start, and the cause."""
@@ -188,9 +196,10 @@ class _Block:
             for row in error.ids.tolist():
                 self._errors.setdefault(row, f"MuJoCo: {self.batch.error(row)}")
 
-    def _copy_fields(self) -> None:
-        for live, target in self._copies:
-            target[:] = live
+    def _copy_fields(self, rows: _Rows) -> None:
+        chosen = slice(None) if rows is None else rows
+        for _, live, target in self._copies:
+            target[chosen] = live[chosen]
 
     def _observe_pose(self, rows: _Rows) -> None:
         chosen = slice(None) if rows is None else rows
@@ -285,6 +294,18 @@ class Group:
     def refresh_all(self) -> None:
         """Compute kinematics, contacts and contact sensors of the current state."""
         self._workers.each(lambda block: block.refresh(_ALL_STAGES), self.blocks)
+
+    @contextlib.contextmanager
+    def refreshed(self, *, contacts: bool = False) -> Iterator[None]:
+        """Inside, kinematics (and contacts) are those of the current state; afterwards all is as it was."""
+        held = [block.held() for block in self.blocks]
+        (self.refresh_all if contacts else self.refresh_kinematics)()
+        try:
+            yield
+        finally:
+            for arrays in held:
+                for array, before in arrays:
+                    array[:] = before
 
     def faults(self) -> list[tuple[int, str]]:
         """Slots in which MuJoCo raised or warned since their start, and the cause."""

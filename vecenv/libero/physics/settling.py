@@ -96,16 +96,20 @@ def _keys(model: mujoco.MjModel, starts: Start) -> list[str]:
 
 def _path(key: str) -> Path | None:
     folder = caching.folder("settled")
-    return None if folder is None else folder / f"{key}.npy"
+    return None if folder is None else folder / f"{key}.state"
 
 
 def _read(key: str, width: int) -> np.ndarray | None:
     """A state [nq + nv] from the cache; None if it is missing or damaged."""
     path = _path(key)
+    data = None if path is None else caching.unsealed(path)
+    if data is None:
+        return None
     with contextlib.suppress(OSError, ValueError, EOFError):
-        state = None if path is None else np.load(path, allow_pickle=False)
-        if state is not None and state.shape == (width,) and state.dtype == float and np.isfinite(state).all():
+        state = np.load(io.BytesIO(data), allow_pickle=False)
+        if state.shape == (width,) and state.dtype == float and np.isfinite(state).all():
             return state
+    caching.damaged(Path(str(path)), "not a state of the scene")
     return None
 
 
@@ -116,4 +120,4 @@ def _write(key: str, state: np.ndarray) -> None:
     np.save(buffer, state)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        caching.write_file(path, buffer.getvalue())
+        caching.write_file(path, caching.sealed(buffer.getvalue()))

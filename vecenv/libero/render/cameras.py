@@ -29,6 +29,7 @@ from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, Use
 from vecenv.libero.render.sources import InstalledVisuals, VisualSource
 from vecenv.libero.scene.bddl import Problem
 from vecenv.observations import CameraView, Rendered, choose_cameras
+from vecenv.util import inputs
 from vecenv.util.transfers import fetch
 
 if TYPE_CHECKING:
@@ -304,9 +305,11 @@ def options_of(given: VisualOptions | Sequence[VisualOptions], num_envs: int) ->
     """One visual option for each slot, from one for all or from B of them.
 
     Raises:
-        RenderError: the number of options is not the number of slots.
+        RenderError: the number of options is not the number of slots, or something is none.
     """
-    options = [given] * num_envs if isinstance(given, VisualOptions) else list(given)
+    options = [given] * num_envs if isinstance(given, VisualOptions) else inputs.items(given, "options", RenderError)
+    if not all(isinstance(option, VisualOptions) for option in options):
+        raise RenderError(f"options={inputs.shown(given)}: expected VisualOptions, one for all slots or one a slot")
     if len(options) != num_envs:
-        raise RenderError(f"{len(options)} visual options for {num_envs} slots")
+        raise RenderError(f"{len(options)} visual options for {num_envs} slots; expected one a slot, or a single one")
     return options

@@ -34,7 +34,8 @@ from vecenv.libero.render.scenery import Scenery, scenery_of
 from vecenv.libero.scene.bddl import Problem
 from vecenv.libero.scene.cache import content_key, named_scene, scene_names
 from vecenv.libero.scene.scene import Scene, compile_scene, scene_source
-from vecenv.libero.tasks.export import IMAGES, ExportError, ExportFolder
+from vecenv.libero.tasks.export import IMAGES, ExportError, ExportFolder, seal
+from vecenv.libero.tasks.seal import break_seal
 from vecenv.libero.tasks.suites import list_suites, list_tasks
 from vecenv.util import caching
 
@@ -112,6 +113,7 @@ def export_images(
         UnknownSuite, AssetsMissing, BDDLError, SceneError: what is to be exported is not there or not in order.
         OSError: the folder cannot be written.
     """
+    break_seal(Path(out))
     names = list_suites() if suites is None else suites
     problems = {_name(problem): problem for suite in names for problem in (t.problem() for t in list_tasks(suite))}
     writer = _Writer(Path(out) / IMAGES)
@@ -126,6 +128,7 @@ def export_images(
         entries.setdefault(name, {})[str(look)] = {"file": path.name, "sha256": digest}
     index = {"format": FORMAT, "mujoco": mujoco.__version__, "scenes": entries}
     caching.write_file(writer.folder / INDEX, json.dumps(index, indent=1).encode())
+    seal(Path(out))
     return ExportedImages(scenes=len(problems), looks=len(chosen), size=sum(files.values()))
 
 
@@ -270,6 +273,7 @@ class ExportedVisuals:
 
     @cached_property
     def _index(self) -> Mapping[str, Mapping[str, Any]]:
+        ExportFolder(self._scenes)  # refuses one that is not as it was sealed
         return _read_index(self._folder, self._again)
 
     @property

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from vecenv.errors import InvalidInput
+from vecenv.util import configs, inputs
 
 # The names that policies use, and MuJoCo's names of the same cameras.
 ALIASES: Mapping[str, str] = MappingProxyType({"wrist": "robot0_eye_in_hand"})
@@ -48,14 +49,19 @@ class UserCamera:
     fovy: npt.ArrayLike = 45.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise RenderError(f"camera {inputs.shown(self.name)}: expected a name")
         for field_name, width in (("pos", 3), ("quat", 4)):
-            value = np.asarray(getattr(self, field_name), float)
+            what, right = f"camera {self.name!r}: {field_name}", f"finite [{width}] or [B, {width}]"
+            value = inputs.floats(getattr(self, field_name), what, right, RenderError)
             if value.ndim not in (1, 2) or value.shape[-1] != width or not np.isfinite(value).all():
-                raise RenderError(f"camera {self.name!r}: {field_name} must be finite [{width}] or [B, {width}]")
+                raise RenderError(f"{what} must be {right}")
         if (np.linalg.norm(np.asarray(self.quat, float), axis=-1) < 1e-6).any():
             raise RenderError(f"camera {self.name!r}: quat has length 0")
-        if not ((np.asarray(self.fovy) > 0) & (np.asarray(self.fovy) < 180)).all():
-            raise RenderError(f"camera {self.name!r}: fovy={self.fovy}: need degrees between 0 and 180")
+        right = "degrees between 0 and 180"
+        fovy = inputs.floats(self.fovy, f"camera {self.name!r}: fovy", right, RenderError)
+        if fovy.ndim > 1 or not ((fovy > 0) & (fovy < 180)).all():
+            raise RenderError(f"camera {self.name!r}: fovy={inputs.shown(self.fovy)}: need {right}")
 
     @classmethod
     def looking_at(
@@ -98,6 +104,9 @@ class CameraShift:
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fovy: float = 0.0
 
+    def __post_init__(self) -> None:
+        configs.check(self, RenderError, vectors=("pos", "turn"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class VisualOptions:
@@ -118,6 +127,14 @@ class VisualOptions:
     cameras: Mapping[str, CameraShift] = field(default_factory=dict)
     colors: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     textures: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.colors, Mapping):
+            scales = {
+                name: configs.vector(value, f"colors[{name!r}]", RenderError) for name, value in self.colors.items()
+            }
+            object.__setattr__(self, "colors", scales)
+        configs.check(self, RenderError, vectors=("light_color", "light_shift"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,6 +221,7 @@ class RenderConfig:
     colors: str = "published"
 
     def __post_init__(self) -> None:
+        configs.check(self, RenderError, ranges={"num_threads": (1, 4096)})
         if not (1 <= self.height <= LARGEST_SIDE and 1 <= self.width <= LARGEST_SIDE):
             raise RenderError(f"images of {self.height} x {self.width} pixels: each side must be 1 to {LARGEST_SIDE}")
         if self.lod not in LODS:
@@ -211,8 +229,6 @@ class RenderConfig:
         if self.engine not in ENGINES:
             raise RenderError(f"engine={self.engine!r}: expected one of {', '.join(ENGINES)}")
         check_colors(self.colors)
-        if self.num_threads is not None and self.num_threads < 1:
-            raise RenderError(f"num_threads={self.num_threads}: need at least 1, or None for one per core")
         names = [camera.name for camera in self.cameras]
         if len(set(names)) != len(names):
             raise RenderError(f"two cameras have the same name: {', '.join(names)}")

@@ -70,8 +70,11 @@ def cached_scene(
         key = None
     if where is None or key is None:
         return compiled_source(source, asked)
-    with contextlib.suppress(SceneFileError):
+    try:
         return read_scene(where, key)
+    except SceneFileError as error:
+        if (where / f"{key}.json").exists() and (where / f"{key}.mjb").exists():
+            caching.damaged(where / f"{key}.mjb", str(error))
     scene = compiled_source(source, asked)
     with contextlib.suppress(OSError):
         write_scene(where, key, scene)

@@ -3,9 +3,9 @@
 In: suites of the installed packages. Out: a folder with ``index.json`` (MuJoCo version, tasks of each suite with
 instruction, BDDL text and scene), ``scenes/`` (each compiled scene in the two files of ``vecenv.libero.scene.cache``)
 and ``starts/{suite}.npz`` (init states, stored and settled). A scene has the contact sensors of all its exported tasks.
-The index is written last and names the checksum of every file of starts. A compiled model belongs to one version of
-MuJoCo, and so does the folder. ``budgets.json`` is there where the contact memory of MJX was measured as well
-(``vecenv.libero.contact_memory``).
+A compiled model belongs to one version of MuJoCo, and so does the folder. ``budgets.json`` is there where the contact
+memory of MJX was measured as well (``vecenv.libero.contact_memory``). ``seal.json`` is written last and names every
+file with its checksum (``vecenv.libero.tasks.seal``); a folder that is not as it was sealed is refused.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ import functools
 import hashlib
 import io
 import json
+import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import mujoco
 import numpy as np
@@ -30,8 +32,9 @@ from vecenv.libero.scene.contacts import Contacts, checked
 from vecenv.libero.scene.lean.geometry import PROFILES, demands
 from vecenv.libero.scene.scene import Scene, scene_source
 from vecenv.libero.tasks import settled
+from vecenv.libero.tasks.seal import SEAL, SealError, break_seal, open_seal, write_seal
 from vecenv.libero.tasks.settled import SettledStarts
-from vecenv.libero.tasks.suites import TaskSpec, list_suites, list_tasks
+from vecenv.libero.tasks.suites import NUM_EPISODES, TaskSpec, list_suites, list_tasks
 from vecenv.util import caching
 
 INDEX, SCENES, STARTS = "index.json", "scenes", "starts"
@@ -39,8 +42,9 @@ INDEX, SCENES, STARTS = "index.json", "scenes", "starts"
 IMAGES = "images"
 BUDGETS = "budgets.json"
 # Layout of the folder; raised when it changes.
-FORMAT = 3
+FORMAT = 4
 
+_Result = TypeVar("_Result")
 Track: TypeAlias = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
@@ -96,6 +100,7 @@ def export(
     """
     checked(contacts)
     folder = _writable(Path(out))
+    break_seal(folder)
     tasks = {suite: list_tasks(suite) for suite in dict.fromkeys(list_suites() if suites is None else suites)}
     sharing: dict[SceneKey, list[Problem]] = {}
     in_suite: dict[tuple[str, SceneKey], list[Problem]] = {}
@@ -113,20 +118,38 @@ def export(
     entries = {suite: _write_suite(folder, tasks[suite], ids) for suite in track(list(tasks), "starts")}
     index = {"format": FORMAT, "mujoco": mujoco.__version__, "contacts": contacts, "suites": entries}
     caching.write_file(folder / INDEX, json.dumps(index, indent=1).encode())
+    written = _files(folder, tasks, ids.values())
+    for path in (*(folder / SCENES).glob("*"), *(folder / STARTS).glob("*.npz")):  # an earlier export's
+        if path not in written and path.suffix in (".mjb", ".json", ".npz"):
+            path.unlink()
+    seal(folder)
     return Exported(
         folder=folder,
         suites=len(tasks),
         tasks=sum(map(len, tasks.values())),
         scenes=len(set(ids.values())),
-        size=sum(path.stat().st_size for path in _files(folder, tasks, ids.values())),
+        size=sum(path.stat().st_size for path in written),
     )
+
+
+def seal(folder: Path) -> None:
+    """Seal a folder that is written.
+
+    Raises:
+        ExportError: it holds a file that no export writes.
+        OSError: a file cannot be read, or the seal not be written.
+    """
+    try:
+        write_seal(folder)
+    except SealError as error:
+        raise ExportError(str(error)) from error
 
 
 def _writable(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder}: not a folder; name a new one, or one that an export wrote")
     if folder.is_dir() and not (folder / INDEX).is_file():
-        ours = (SCENES, STARTS, IMAGES, BUDGETS)  # left by an export that was interrupted
+        ours = (SCENES, STARTS, IMAGES, BUDGETS, SEAL)  # left by an export that was interrupted
         others = [path.name for path in folder.iterdir() if path.name not in ours and not path.name.startswith(".")]
         if others:
             raise ExportError(f"{folder}: not an export, it holds {min(others)}; name a new folder")
@@ -184,7 +207,9 @@ def _write_suite(
 
 def write_budgets(folder: Path, budgets: Mapping[str, Mapping[str, int | None]]) -> None:
     """Write the contact memory of scenes, by ``vecenv.libero.physics.budgets.key_of``, into an exported folder."""
+    break_seal(folder)
     caching.write_file(folder / BUDGETS, json.dumps(dict(sorted(budgets.items())), indent=1).encode())
+    seal(folder)
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
@@ -219,12 +244,11 @@ class ExportedTask:
 
     def init_states(self) -> np.ndarray:
         """The stored init states [50, 1 + nq + nv]; raises `ExportError`."""
-        return self.folder.starts(self.suite)[f"raw_{self.index}"]
+        return self.folder.array(self.suite, f"raw_{self.index}")
 
     def settled(self) -> SettledStarts:
         """The init states at rest; raises `ExportError`."""
-        arrays = self.folder.starts(self.suite)
-        return SettledStarts(arrays[f"qpos_{self.index}"], arrays[f"qvel_{self.index}"])
+        return SettledStarts(*(self.folder.array(self.suite, f"{name}_{self.index}") for name in ("qpos", "qvel")))
 
     def scene(
         self,
@@ -256,7 +280,7 @@ _parsed = functools.lru_cache(maxsize=512)(parse_problem)
 
 
 class ExportFolder:
-    """An exported folder, opened: its index is read and checked at once, scenes and starts on access.
+    """An exported folder, opened: seal and index are read and checked at once, scenes and starts on access.
 
     Args:
         path: the folder.
@@ -269,6 +293,7 @@ class ExportFolder:
         self.path = Path(path)
         self._again = f"run `vecenv compile --out {self.path}` again"
         self._index = self._read_index()
+        self._seal = self._sealed(lambda: open_seal(self.path))
         self._scenes: dict[str, Scene] = {}
         self._starts: dict[str, dict[str, np.ndarray]] = {}
 
@@ -302,6 +327,8 @@ class ExportFolder:
     def scene(self, key: str) -> Scene:
         """A scene, the same object for the same id; raises `ExportError`."""
         if key not in self._scenes:
+            for suffix in (".mjb", ".json"):
+                self.check(f"{SCENES}/{key}{suffix}")
             try:
                 self._scenes[key] = read_scene(self.path / SCENES, key)
             except SceneFileError as error:
@@ -312,12 +339,36 @@ class ExportFolder:
         """The read-only arrays ``raw_{task}``, ``qpos_{task}`` and ``qvel_{task}`` of a suite; raises `ExportError`."""
         if suite not in self._starts:
             path = self.path / STARTS / f"{suite}.npz"
+            self.check(f"{STARTS}/{suite}.npz")
             data = self._read(path)
             if hashlib.sha256(data).hexdigest() != self._index[suite][0]:
                 raise ExportError(f"{path}: damaged: not the file that {INDEX} names; {self._again}")
-            with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                self._starts[suite] = {name: _frozen(file[name]) for name in file.files}
+            try:
+                with np.load(io.BytesIO(data), allow_pickle=False) as file:
+                    self._starts[suite] = {name: _frozen(file[name]) for name in file.files}
+            except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+                raise ExportError(f"{path}: damaged: not the starts of an export; {self._again}") from error
         return self._starts[suite]
+
+    def array(self, suite: str, name: str) -> np.ndarray:
+        """One of the arrays of ``starts``, finite floats of 50 rows; raises `ExportError`."""
+        found, path = self.starts(suite).get(name), self.path / STARTS / f"{suite}.npz"
+        if found is None or found.ndim != 2 or len(found) != NUM_EPISODES or found.dtype.kind != "f":
+            raise ExportError(f"{path}: damaged: {name} is missing, or not the states of {NUM_EPISODES} episodes")
+        bad = ~np.isfinite(found).all(axis=1)
+        if bad.any():
+            raise ExportError(f"{path}: damaged: {name} of episode {int(bad.argmax())} is not finite; {self._again}")
+        return found
+
+    def check(self, name: str) -> None:
+        """Check the contents of a file, given its path in the folder; raises `ExportError`."""
+        self._sealed(lambda: self._seal.check(name))
+
+    def _sealed(self, call: Callable[[], _Result]) -> _Result:
+        try:
+            return call()
+        except SealError as error:
+            raise ExportError(f"{error}; {self._again}") from error
 
     def budgets(self) -> Mapping[str, Mapping[str, int | None]]:
         """The numbers of each ``Budget`` by ``vecenv.libero.physics.budgets.key_of``; empty where none was exported.

@@ -19,6 +19,7 @@ from vecenv.libero.scene.bddl import Problem, Region
 from vecenv.libero.scene.scene import Entity, Scene
 from vecenv.libero.tasks import resets
 from vecenv.protocols import ResetLoop
+from vecenv.util import inputs
 
 MODES = ("center", "sampled", "upstream")
 
@@ -145,12 +146,18 @@ def _given(fixtures: str | Mapping[str, Any], scene: Scene) -> dict[str, tuple[n
     for name, pose in _mapping(fixtures).items():
         if name not in scene.entities or not scene.entities[name].fixture:
             continue
-        try:
-            pos, quat = (np.asarray(part, float) for part in pose)
-        except (TypeError, ValueError) as error:
-            raise FixtureError(f"fixtures[{name!r}]: expected (pos [3], quat wxyz [4]), got {pose!r}") from error
-        given[name] = (pos, quat)
+        given[name] = _pose(name, pose)
     return given
+
+
+def _pose(name: str, pose: Any) -> tuple[np.ndarray, np.ndarray]:
+    right = "(pos [3], quat wxyz [4])"
+    try:
+        pos, quat = pose
+    except (TypeError, ValueError) as error:
+        raise FixtureError(f"fixtures[{name!r}]: expected {right}, got {inputs.shown(pose)}") from error
+    what = f"fixtures[{name!r}]"
+    return inputs.floats(pos, what, right, FixtureError), inputs.floats(quat, what, right, FixtureError)
 
 
 def _mapping(fixtures: str | Mapping[str, Any]) -> Mapping[str, Any]:
@@ -163,16 +170,25 @@ def _mapping(fixtures: str | Mapping[str, Any]) -> Mapping[str, Any]:
     return {}
 
 
-def check_names(fixtures: str | Mapping[str, Any], scenes: Sequence[Scene]) -> None:
-    """Refuse an unknown mode, and a mapping that names a fixture none of the scenes has.
+def check(fixtures: str | Mapping[str, Any], scenes: Sequence[Scene], num_envs: int) -> None:
+    """Refuse an unknown mode, a mapping that names a fixture none of the scenes has, and poses that are none.
 
     Raises:
         FixtureError: it is one.
     """
     known = {entity.name for scene in scenes for entity in scene.fixtures}
-    unknown = sorted(set(_mapping(fixtures)) - known)
+    unknown = [name for name in _mapping(fixtures) if name not in known]
     if unknown:
-        raise FixtureError(f"fixtures names {unknown[0]!r}; these scenes have {', '.join(sorted(known)) or 'none'}")
+        there = ", ".join(sorted(known)) or "none"
+        raise FixtureError(f"fixtures names {inputs.shown(unknown[0])}; these scenes have {there}")
+    for name, pose in _mapping(fixtures).items():
+        arrays = _pose(name, pose)
+        _rows(name, *arrays, range(num_envs))
+        for label, array in zip(("pos", "quat"), arrays, strict=True):
+            if array.ndim == 2 and len(array) != num_envs:
+                raise FixtureError(
+                    f"fixtures[{name!r}] {label}: {len(array)} rows for {num_envs} slots; expected one a slot"
+                )
 
 
 def _rows(name: str, pos: np.ndarray, quat: np.ndarray, slots: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import bz2
 import contextlib
+import errno
 import gzip
+import itertools
 import lzma
-import shutil
 import tarfile
 import tempfile
 import zipfile
@@ -23,6 +24,9 @@ from typing import IO
 from vecenv.simpler.assets.errors import PullError, reason
 
 CHUNK = 1 << 16
+# Limits of what an archive may hold: bytes of a decompressed tar, in all, and beyond the first ones by how much it may
+# be larger than the archive (meshes and images: at most ten times); and entries.
+MAX_PLAIN, _FREE, _RATIO, MAX_ENTRIES = 1 << 34, 1 << 26, 100, 1 << 17
 _SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2")
 _DECOMPRESSORS: dict[bytes, Callable[[Path], IO[bytes]]] = {
     b"\x1f\x8b": gzip.open,  # type: ignore[dict-item]
@@ -36,6 +40,20 @@ DAMAGE = (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFE
 def is_archive(name: str) -> bool:
     """Whether a file name ends like an archive's."""
     return name.endswith(_SUFFIXES)
+
+
+def copy_at_most(stream: IO[bytes], to: IO[bytes], most: int) -> None:
+    """Copy a stream of at most so many bytes.
+
+    Raises:
+        OSError: it has more, for example because a small archive decompresses to endless zeros.
+    """
+    size = 0
+    while chunk := stream.read(CHUNK):
+        size += len(chunk)
+        if size > most:
+            raise OSError(errno.EFBIG, f"decompresses to more than {most} bytes")
+        to.write(chunk)
 
 
 @dataclass(frozen=True)
@@ -95,7 +113,7 @@ def _decompressed(path: Path, scratch: Path) -> Iterator[IO[bytes]]:
             return
     with tempfile.TemporaryFile(dir=scratch) as plain:
         with opener(path) as stream:
-            shutil.copyfileobj(stream, plain, CHUNK)
+            copy_at_most(stream, plain, min(MAX_PLAIN, _FREE + _RATIO * path.stat().st_size))
         plain.seek(0)
         yield plain
 
@@ -104,6 +122,8 @@ def _zip_members(archive: zipfile.ZipFile) -> Members:
     def opener(info: zipfile.ZipInfo) -> Callable[[], IO[bytes]]:
         return lambda: archive.open(info)
 
+    if len(archive.infolist()) > MAX_ENTRIES:
+        raise zipfile.BadZipFile(f"more than {MAX_ENTRIES} entries")
     infos = [info for info in archive.infolist() if not info.is_dir()]
     return Members((info.filename, Member(info.file_size, opener(info))) for info in infos)
 
@@ -117,4 +137,7 @@ def _tar_members(archive: tarfile.TarFile) -> Members:
 
         return opened
 
-    return Members((info.name, Member(info.size, opener(info))) for info in archive if info.isfile())
+    listed = list(itertools.islice(archive, MAX_ENTRIES + 1))
+    if len(listed) > MAX_ENTRIES:
+        raise tarfile.TarError(f"more than {MAX_ENTRIES} entries")
+    return Members((info.name, Member(info.size, opener(info))) for info in listed if info.isfile())

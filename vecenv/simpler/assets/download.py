@@ -8,9 +8,12 @@ because pooch's downloader begins every file anew and follows redirects to any h
 from __future__ import annotations
 
 import contextlib
+import os
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import IO, Literal
 
 import httpx
 import tenacity
@@ -30,12 +33,16 @@ class RetryPolicy:
         connect: timeout of a connection, seconds.
         read: longest time without a byte, seconds.
         wait: seconds before the second try; doubled each time, at most thirty.
+        slowest: bytes a second; a try whose content comes more slowly ends.
+        patience: seconds over which that is measured, again and again.
     """
 
     attempts: int = 5
     connect: float = 10.0
     read: float = 30.0
     wait: float = 0.5
+    slowest: float = 1000.0
+    patience: float = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,10 +108,27 @@ def download(
         wait=tenacity.wait_exponential(multiplier=policy.wait, max=30),
         retry=tenacity.retry_if_exception_type(TransferError),
         reraise=True,
-    )(_try_once, client, url, part, expected, hosts)
+    )(_try_once, client, url, part, expected, hosts, policy)
 
 
-def _try_once(client: httpx.Client, url: str, part: Path, expected: ExpectedContent, hosts: Sequence[str]) -> None:
+def opened(part: Path, mode: Literal["wb", "r+b"]) -> IO[bytes]:
+    """Open a partial file to write; never through a link, which would lead to another file.
+
+    Raises:
+        OSError: it is a link, or cannot be written.
+    """
+    flags = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | (os.O_CREAT | os.O_TRUNC if mode == "wb" else 0)
+    return os.fdopen(os.open(part, flags, 0o666), "wb" if mode == "wb" else "r+b")
+
+
+def _try_once(
+    client: httpx.Client,
+    url: str,
+    part: Path,
+    expected: ExpectedContent,
+    hosts: Sequence[str],
+    policy: RetryPolicy,
+) -> None:
     size = part.stat().st_size if part.exists() else 0
     if size >= expected.max_bytes:
         size = 0
@@ -116,7 +140,7 @@ def _try_once(client: httpx.Client, url: str, part: Path, expected: ExpectedCont
                 raise TransferError("the server has no more bytes than were already received")
             _check_status(response)
             resumed = response.status_code == httpx.codes.PARTIAL_CONTENT and _resumes_at(response, size)
-            _write(response, part, size if resumed else 0, expected.max_bytes)
+            _write(response, part, size if resumed else 0, expected.max_bytes, policy)
     except httpx.InvalidURL as error:
         raise FileNotInSource(f"not a web address: {error}") from error
     except (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout) as error:
@@ -168,8 +192,9 @@ def _resumes_at(response: httpx.Response, size: int) -> bool:
     return True
 
 
-def _write(response: httpx.Response, part: Path, size: int, max_bytes: int) -> None:
-    with part.open("r+b" if size else "wb") as file:
+def _write(response: httpx.Response, part: Path, size: int, max_bytes: int, policy: RetryPolicy) -> None:
+    since, at_least = time.monotonic(), size + policy.slowest * policy.patience
+    with opened(part, "r+b" if size else "wb") as file:
         file.seek(size)
         for chunk in response.iter_raw():  # with a chunk size, bytes would be held back and lost on an interruption
             size += len(chunk)
@@ -177,3 +202,7 @@ def _write(response: httpx.Response, part: Path, size: int, max_bytes: int) -> N
                 file.truncate(0)
                 raise TransferError(f"is longer than {max_bytes} bytes")
             file.write(chunk)
+            if time.monotonic() - since >= policy.patience:
+                if size < at_least:
+                    raise TransferError(f"comes more slowly than {policy.slowest:.0f} bytes a second")
+                since, at_least = time.monotonic(), size + policy.slowest * policy.patience

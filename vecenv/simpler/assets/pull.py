@@ -23,8 +23,8 @@ from urllib.parse import quote
 import httpx
 
 from vecenv.simpler.assets import files as assets
-from vecenv.simpler.assets.archives import CHUNK, DAMAGE, Members, is_archive, open_archive
-from vecenv.simpler.assets.download import ExpectedContent, RetryPolicy, download, make_client
+from vecenv.simpler.assets.archives import DAMAGE, Members, copy_at_most, is_archive, open_archive
+from vecenv.simpler.assets.download import ExpectedContent, RetryPolicy, download, make_client, opened
 from vecenv.simpler.assets.errors import FileNotInSource, PullError, ServerUnreachable, TransferError, reason
 from vecenv.simpler.assets.files import Entry, Manifest, read_manifest
 
@@ -131,6 +131,8 @@ def pull(
         PullError: the source does not exist, the folder cannot be written, or another pull is filling it.
         ManifestError: the manifest is damaged.
     """
+    if source is not None and not source.strip():
+        raise PullError(f"source={source!r}: expected a folder, an archive or a web address")
     wanted = manifest or read_manifest()
     try:
         root.mkdir(parents=True, exist_ok=True)
@@ -143,8 +145,10 @@ def pull(
 @contextlib.contextmanager
 def _locked(root: Path) -> Iterator[None]:
     folder = root / _PARTIAL_FOLDER
+    if folder.is_symlink():
+        raise PullError(f"{folder} is a link; partial downloads are not written through it: remove it")
     folder.mkdir(exist_ok=True)
-    with (folder / "lock").open("w") as lock:
+    with opened(folder / "lock", "wb") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -174,7 +178,10 @@ class _Pull:
         self._count(len(kept))
         wanted = [entry for entry in targets if entry not in kept]
         with make_client(self.policy) as client:
-            rest = self._from_source(client, source, wanted) if source else self._from_known_sources(client, wanted)
+            if source is None:
+                rest = self._from_known_sources(client, wanted)
+            else:
+                rest = self._from_source(client, source, wanted)
         fetched = [entry.path for entry in wanted if entry not in rest]
         missing = {entry.path: self.missing.get(entry.path, "no source has it") for entry in rest}
         notes = {path: note for path in missing if (note := assets.stand_in_note(path, self.root))}
@@ -252,7 +259,7 @@ class _Pull:
         for entry in entries:
             target = self._target(entry)
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(part, copy)
+            _copy(part, copy)
             copy.replace(target)
         part.unlink()
         self._count(len(entries))
@@ -277,6 +284,12 @@ class _Pull:
         with self._lock:
             self._finished += number
             self.progress(self._finished, len(self.manifest.files))
+
+
+def _copy(source: Path, to: Path) -> None:
+    """Copy a file, of at most ``_MAX_FILE`` bytes, and not through a link."""
+    with source.open("rb") as stream, opened(to, "wb") as file:
+        copy_at_most(stream, file, _MAX_FILE)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -310,7 +323,7 @@ class Folder:
         if not found.is_file():
             raise FileNotInSource(f"not in {self._root}")
         part = self._partial(entry.key)
-        shutil.copyfile(found, part)
+        _copy(found, part)
         if not entry.matches(part):
             part.unlink()
             raise FileNotInSource(f"{found} has other content than the manifest says")
@@ -328,8 +341,8 @@ class OpenArchive:
         part = self._partial(entry.key)
         for member in self._members.named(entry.path.name, entry.size, _MAX_FILE):
             try:
-                with member.open() as stream, part.open("wb") as file:
-                    shutil.copyfileobj(stream, file, CHUNK)
+                with member.open() as stream, opened(part, "wb") as file:
+                    copy_at_most(stream, file, min(member.size, _MAX_FILE))
             except DAMAGE as error:
                 part.unlink(missing_ok=True)
                 raise FileNotInSource(f"damaged in {self._name}: {reason(error)}") from error

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vecenv.errors import InvalidInput
 from vecenv.simpler.control.controllers import Controller
 from vecenv.simpler.control.robots import WIDOWX, Robot
 from vecenv.simpler.control.rotations import (
@@ -20,6 +21,7 @@ from vecenv.simpler.control.rotations import (
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
+from vecenv.util import configs, inputs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +45,11 @@ class ServoConfig:
     lead: float = 2.0
     stuck_after: int = 6
     nearer: float = 0.1
+
+    def __post_init__(self) -> None:
+        numbers = ("pos_tol", "rot_tol", "max_advance_pos", "max_advance_rot", "lead", "nearer")
+        counts: dict[str, tuple[int, int]] = dict.fromkeys(("max_steps", "stuck_after"), (1, inputs.MOST_COUNT))
+        configs.check(self, InvalidInput, positive=numbers, ranges=counts)
 
     @classmethod
     def of(cls, robot: Robot) -> ServoConfig:

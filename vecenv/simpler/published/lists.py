@@ -33,14 +33,14 @@ from __future__ import annotations
 
 import difflib
 import functools
-from collections.abc import Iterator, Mapping, Sequence, Sized
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from vecenv.placement import Placement, PlacementError, cross
+from vecenv.placement import Placement, PlacementError, cross, each_read_once, episode_indices, integers
 from vecenv.protocols import ProtocolError
 from vecenv.simpler.layouts import Choices, Layout, drawn, episode_seed, lay_out, unseeded_seeds
 from vecenv.simpler.published.specs import (
@@ -142,14 +142,18 @@ def place(protocol: str, suite: str, tasks: object, episodes: object) -> Placeme
         PlacementError: a task or an episode that does not exist, or nothing to place.
     """
     there, names = counts(protocol, suite), [task.name for task in list_tasks(suite)]
-    chosen = cross(list(there) if tasks is None else tasks, [0], num_tasks=len(names), num_episodes=1).task.tolist()
+    listed = list(there) if tasks is None else integers(tasks, "task")
+    if not listed:
+        raise PlacementError("no slot to fill: tasks or episodes are empty")
+    chosen = cross(listed, [0], num_tasks=len(names), num_episodes=1).task.tolist()
+    episodes = each_read_once(episodes, chosen)
     parts = []
     for task in chosen:
         count = len(_checked(protocol, names[task]))
         wanted = episodes.get(task, ()) if isinstance(episodes, Mapping) else episodes
-        if wanted is None or not isinstance(wanted, Sized) or len(wanted):
-            every = range(count) if wanted is None else wanted
-            parts.append(cross([task], every, num_tasks=len(names), num_episodes=count))
+        indices = range(count) if wanted is None else episode_indices(wanted, count)
+        if len(indices):
+            parts.append(cross([task], indices, num_tasks=len(names), num_episodes=count))
     if not parts:
         raise PlacementError("no slot to fill: tasks or episodes are empty")
     columns = [np.concatenate([getattr(part, column) for part in parts]) for column in ("task", "episode")]

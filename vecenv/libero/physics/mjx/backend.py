@@ -161,6 +161,17 @@ class MjxGroup:
         """Compute kinematics, contacts and contact sensors of the current state."""
         self._fresh, self._fetched = self.compiled.forward(self.system, self.worlds), {}
 
+    @contextmanager
+    def refreshed(self, *, contacts: bool = False) -> Iterator[None]:
+        """Inside, kinematics and contacts are those of the current state; afterwards all is as it was."""
+        del contacts
+        before = self._fresh, self._fetched
+        self.refresh_all()
+        try:
+            yield
+        finally:
+            self._fresh, self._fetched = before
+
 
 class MjxPhysics(Physics[MjxGroup]):
     """A batch of worlds on MJX, slots in the caller's order.

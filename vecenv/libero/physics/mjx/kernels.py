@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import logging
 import os
 import threading
@@ -203,13 +204,33 @@ def _replaced(owner: Any, name: str, replacement: Callable[..., Any]) -> Iterato
 
 
 def is_cached(kernels: Kernels) -> bool:
-    """Whether Warp's cache has these kernels for this device."""
-    import warp as wp
+    """Whether Warp's cache has these kernels for this device; damaged ones are removed with a warning."""
 
     if (kernels.device.context, kernels.block_dim) in kernels.module.execs:
         return True
+    path = _file(kernels)
+    seal = path.with_name(f"{path.name}.sha256")
+    try:
+        sound = hashlib.sha256(path.read_bytes()).hexdigest() == seal.read_text()
+    except FileNotFoundError:
+        return path.exists()  # what others compiled has no checksum
+    except (OSError, ValueError) as error:
+        sound, why = False, str(error)
+    else:
+        why = "its checksum is another"
+    if not sound:
+        caching.damaged(path, why)
+        with contextlib.suppress(OSError):
+            path.unlink()
+    return sound
+
+
+def _file(kernels: Kernels) -> Path:
+    """Where Warp's cache has these kernels for this device, or would have them."""
+    import warp as wp
+
     folder = Path(str(wp.config.kernel_cache_dir)) / kernels.module.get_module_identifier(kernels.block_dim)
-    return (folder / kernels.module._get_compile_output_name(kernels.device, block_dim=kernels.block_dim)).exists()
+    return folder / kernels.module._get_compile_output_name(kernels.device, block_dim=kernels.block_dim)
 
 
 def compile_kernels(missing: Sequence[Kernels], *, cached: int = 0, threads: int | None = None) -> None:
@@ -235,6 +256,11 @@ def compile_kernels(missing: Sequence[Kernels], *, cached: int = 0, threads: int
             if time.monotonic() - said >= _REPORT:
                 said = time.monotonic()
                 log.info("compiled %d of %d kernels, %.0f s", done, count, said - started)
+    for each in missing:
+        with contextlib.suppress(OSError):
+            path = _file(each)
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            caching.write_file(path.with_name(f"{path.name}.sha256"), digest.encode())
     log.info("compiled %d kernels in %.1f s", count, time.monotonic() - started)
 
 
