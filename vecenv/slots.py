@@ -227,11 +227,6 @@ class SlotBatch(ABC):
         self._live |= stale
         self._quarantine(stale)
 
-    def tool_poses(self) -> np.ndarray:
-        """Poses of the end effectors, xyz (metres) and wxyz, world frame, [B, 7], a copy."""
-        self._check_live()
-        return self._tools()
-
     def _clear(self, rows: np.ndarray) -> None:
         """No tick, reward, verdict or fault in some slots."""
         for array in (self._terminated, self._truncated, self._success, self._solved, self._steps, self._reward):

@@ -124,7 +124,8 @@ class WebSocketLink:
             ping_interval=None,
             proxy=None,
         )
-        return self._open_connections.enter_context(opening)
+        self._open_connections.enter_context(opening)
+        return opening
 
     def _exchange(self, connection: ClientConnection) -> Exchange:
         return Exchange(connection, self._server, self._config.timeout_s)

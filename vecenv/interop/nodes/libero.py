@@ -187,7 +187,7 @@ class CloseGripper(StepTool):
         """One hold, which takes control ticks of the episode."""
 
         def job(env: BatchEnv, episode: EpisodeInfo) -> dict[str, Any]:
-            pose = np.append(cast(SlotBatch, env).tool_poses()[0], 1.0)
+            pose = np.append(cast(SlotBatch, env).ee_poses[0], 1.0)
             return motion_outputs(step_pose(self.manager, env, EePoseText(pose, config.hold_steps), EePoseConfig()))
 
         return self.manager.run(job)

@@ -214,7 +214,7 @@ class EnvManager:
 
     def _begin(self, env: BatchEnv, selection: Selection) -> EpisodeInfo:
         info: ResetInfo = env.reset()
-        home = cast(SlotBatch, env).tool_poses()[0]
+        home = cast(SlotBatch, env).ee_poses[0]
         # Physics that fails at the start ends the episode before its first tick.
         self.closed_grip, self._flags = False, Flags(truncated=bool(env.done[0]))
         self._episode = EpisodeInfo(selection, info.instruction[0], int(info.max_steps[0]), home)
