@@ -42,7 +42,9 @@ def cells(line: str) -> list[str]:
 ROWS = {cells(line)[0].strip("`"): cells(line)[1:] for line in TEXT.splitlines() if re.match(r"\| `\w+__\w+` \|", line)}
 
 
-@pytest.mark.parametrize("tool", [tool for nodes in SETS.values() for tool in nodes.get_tools()], ids=str)
+@pytest.mark.parametrize(
+    "tool", [tool for nodes in SETS.values() for tool in nodes.get_tools()], ids=lambda tool: tool.node_type
+)
 def test_the_table_lists_every_tool(tool: Tool) -> None:
     inputs, outputs, options = (re.sub(r"[`]", "", cell) for cell in ROWS[tool.node_type])
     assert inputs == ", ".join(port.name + "?" * port.optional for port in tool.inputs)
