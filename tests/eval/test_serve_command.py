@@ -70,6 +70,11 @@ def test_a_signal_ends_the_server_and_keeps_what_has_ended(
         ready(url, "ready")
         stream = streams.opened_at(url)
         httpx.post(f"{url}/api/panel/actions", json={"action": "step", "ticks": 10}, headers=WRITER, timeout=60)
+        (shown,) = httpx.get(f"{url}/api/runs", timeout=60).json()["runs"]
+        total, deadline = 0, time.monotonic() + 60
+        while total == 0 and time.monotonic() < deadline:
+            total = httpx.get(f"{url}/api/runs/{shown['run']}/episodes", timeout=60).json()["total"]
+            time.sleep(0.1)
         process.send_signal(number)
         out, err = process.communicate(timeout=60)
         stream.close()
@@ -78,6 +83,7 @@ def test_a_signal_ends_the_server_and_keeps_what_has_ended(
     assert out.endswith("stopped\n")
     (folder,) = tmp_path.iterdir()
     assert len(ResultStore.open(folder).records()) == 1
+    assert (shown["folder"], total) == (str(folder), 1)
     assert json.loads((folder / "summary.json").read_text())["complete"] is False
 
 

@@ -144,6 +144,7 @@ def _run(
     from vecenv_eval.panel.choices import check_live
     from vecenv_eval.panel.session import Session
     from vecenv_eval.web.app import create_app
+    from vecenv_eval.web.routes_runs import runs_router
     from vecenv_eval.web.server import Server
 
     if first is not None:
@@ -166,7 +167,9 @@ def _run(
         reported(),
         Session(first, out=out, max_slots=settings.max_slots, play=play) as session,
     ):
-        app = create_app(session, settings)
+        # What `vecenv view` shows of a results folder, of the runs of this server.
+        runs = [] if out is None else [runs_router([], drives=True, below=out)]
+        app = create_app(session, settings, routers=runs)
         if scene is not None:
             from vecenv_eval.web.routes_view3d import attach_view3d
 

@@ -11,6 +11,7 @@ import json
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
+from pathlib import Path as Directory
 from typing import Annotated, Any, Literal, cast
 
 import numpy as np
@@ -20,7 +21,7 @@ from fastapi.responses import FileResponse, Response
 
 from vecenv.errors import NotFound, VecenvError
 from vecenv_eval.report.compare import mcnemar
-from vecenv_eval.store import Record
+from vecenv_eval.store import CONFIG, Record
 from vecenv_eval.store.record import to_plain
 from vecenv_eval.web.live import FRESH_S, LiveFrame, live_frames
 from vecenv_eval.web.recorded import WHOLE, DemoFacts, Recordings, Unreadable, VideoFacts, curves, video_frame
@@ -44,7 +45,7 @@ from vecenv_eval.web.run_models import (
     run_info,
     verdict_of,
 )
-from vecenv_eval.web.runs import Leg, RunReader, Snapshot
+from vecenv_eval.web.runs import Leg, RunReader, Snapshot, slug
 
 # Seconds between two looks for a reader of the stream, and the share of the time that they may take.
 _LOOK_S, _SHARE = 0.5, 0.2
@@ -68,15 +69,24 @@ class Runs:
     Args:
         sources: the runs.
         drives: the server drives a session too.
+        below: a folder whose results folders are runs as well, as they come.
 
     Attributes:
         streams: how many readers there are of the stream.
     """
 
-    def __init__(self, sources: Sequence[RunReader], drives: bool = False) -> None:
-        self.drives, self.streams = drives, 0
+    def __init__(self, sources: Sequence[RunReader], drives: bool = False, below: Directory | None = None) -> None:
+        self.drives, self.streams, self._below = drives, 0, below
         self.readers = {source.name: source for source in sources}
         self.recordings, self.redrawer = Recordings(), Redrawer()
+
+    def look(self) -> list[str]:
+        """Names of all runs, those included that have begun since."""
+        there = [] if self._below is None or not self._below.is_dir() else sorted(self._below.iterdir())
+        for folder in there:
+            if slug(folder.name) not in self.readers and not folder.is_symlink() and (folder / CONFIG).is_file():
+                self.readers[slug(folder.name)] = RunReader(slug(folder.name), folder)
+        return list(self.readers)
 
     def snapshot(self, run: str) -> Snapshot:
         """A run as it is.
@@ -84,7 +94,7 @@ class Runs:
         Raises:
             NotFound: no such run was opened.
         """
-        if run not in self.readers:
+        if run not in self.readers and run not in self.look():
             raise NotFound(f"no run {run!r:.100} was opened; there are {', '.join(self.readers) or 'none'}")
         return self.readers[run].snapshot()
 
@@ -140,14 +150,15 @@ class Runs:
         return _jpeg(self.redrawer.frame(demo, tick, camera), size)
 
 
-def runs_router(sources: Sequence[RunReader], *, drives: bool = False) -> APIRouter:
+def runs_router(sources: Sequence[RunReader], *, drives: bool = False, below: Directory | None = None) -> APIRouter:
     """The routes below ``/api/runs``.
 
     Args:
         sources: the runs that were opened (``vecenv_eval.web.runs.open_runs``).
         drives: the server drives a session too, which the page then has a link to.
+        below: a folder whose results folders are runs as well, as they come.
     """
-    runs = Runs(sources, drives)
+    runs = Runs(sources, drives, below)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -170,7 +181,7 @@ def _add_lists(router: APIRouter, runs: Runs) -> None:
     @router.get("")
     def opened() -> RunList:
         """The runs that were opened."""
-        infos = [runs.snapshot(name) for name in runs.readers]
+        infos = [runs.snapshot(name) for name in runs.look()]
         return RunList(
             runs=[
                 RunRow(run=info.name, folder=clean(str(info.folder)), state=runs.state(info, live_frames(info)))

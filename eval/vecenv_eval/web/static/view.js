@@ -167,7 +167,7 @@ async function begin() {
     });
     document.body.dataset.ready = "";
   } catch (error) {
-    complain(error.status === 404 ? new Error("This server shows no runs: vecenv view DIR does.") : error);
+    complain(error.status === 404 ? new Error("This server keeps no runs: vecenv serve --out DIR does, and vecenv view DIR shows finished ones.") : error);
   }
 }
 
