@@ -39,6 +39,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -132,8 +133,16 @@ class Instant:
     def act(self, env: BatchEnv) -> np.ndarray:
         if self._images:
             seen = env.observe_egocentric(~env.done).images
-            assert all(seen[name].any() for name in ("agentview", "wrist"))
+            if black := [name for name in ("agentview", "wrist") if not seen[name].any()]:
+                raise RuntimeError(f"black images of {' and '.join(black)}: {_standing(env)}")
         return np.tile(self._chunk, (env.num_envs, 1, 1))
+
+
+def _standing(env: BatchEnv) -> str:
+    """How many slots are live, and what failed in the others."""
+    faults = Counter(env.step_continuous(np.zeros((env.num_envs, 0, 7))).info["fault"])
+    told = "; ".join(f"{count} x {fault}" for fault, count in faults.items() if fault) or "none"
+    return f"{int((~env.done).sum())} of {env.num_envs} slots live, faults: {told}"
 
 
 class SlowChunk:

@@ -168,6 +168,17 @@ def test_bad_numbers_are_sanitized_and_reported(env: BatchEnv) -> None:
         env.step_continuous(np.zeros((2, 6)))
 
 
+def test_a_chunk_without_actions_moves_nothing_and_says_how_the_slots_stand(env: BatchEnv) -> None:
+    env.reset()
+    env.step_continuous(np.zeros((2, 7)))
+    env.end_episodes([1])
+    before = env.state()
+    control = env.step_continuous(np.zeros((2, 0, 7)))
+    assert (control.done.tolist(), control.info["fault"]) == ([False, True], ("", ""))
+    assert (control.step_index.tolist(), control.info["ticks"].tolist()) == ([1, 1], [0, 0])
+    np.testing.assert_array_equal(env.state().qpos, before.qpos)
+
+
 def test_an_empty_pose_is_a_no_op_and_a_bad_one_is_an_error_of_its_slot(env: BatchEnv) -> None:
     env.reset()
     assert env.step_ee_pose([]).step_count.tolist() == [0, 0]

@@ -32,6 +32,7 @@ class Scripted(SlotBatch):
         super().__init__("suite", num_envs, **options)
         self.armed: list[list[int]] = []
         self.failures: dict[int, str] = {}
+        self.failing_starts: dict[int, str] = {}
         self._place(placing.cross(range(num_envs), [0], num_tasks=num_envs, num_episodes=50))
 
     def tick(self, success: tuple[int, ...] = (), fail: Mapping[int, str] | None = None) -> Control:
@@ -51,6 +52,7 @@ class Scripted(SlotBatch):
     def _arm(self, stale: np.ndarray) -> None:
         self.armed.append(np.flatnonzero(stale).tolist())
         self.failures = {slot: reason for slot, reason in self.failures.items() if not stale[slot]}
+        self.failures |= {slot: reason for slot, reason in self.failing_starts.items() if stale[slot]}
 
     def _instruction(self, slot: int) -> str:
         return f"do {self._placement.task[slot]}"
@@ -104,6 +106,22 @@ def test_a_slot_that_fails_in_the_tick_of_its_success_has_none_and_earns_nothing
     assert control.truncated.tolist() == [False, True, False]
     assert control.info["fault"] == ("", "it broke", "")
     assert env.evaluate().cumulative_reward.tolist() == [1, 0, 0]
+
+
+def test_slots_that_fail_in_reset_are_done_and_said_to_be(caplog: pytest.LogCaptureFixture) -> None:
+    env = Scripted(3)
+    env.failing_starts = {0: "it broke", 2: "it broke"}
+    env.reset()
+    assert env.done.tolist() == [True, False, True]
+    (said,) = caplog.records
+    assert (said.levelname, said.name) == ("WARNING", "vecenv.slots")
+    for part in ("suite, tasks a, b, c", "3 slots; 1 running", "2 of 3 slots failed in reset", "it broke"):
+        assert part in said.getMessage()
+    caplog.clear()
+    env.failing_starts = {1: "live, so it does not begin again"}
+    env.reset()
+    assert not env.done.any()
+    assert not caplog.records
 
 
 def test_the_first_failure_of_a_slot_is_the_one_reported(env: Scripted) -> None:

@@ -233,11 +233,11 @@ class BatchEnv(Protocol):
         ...
 
     def reset(self) -> ResetInfo:
-        """Make every slot live; live slots are not changed."""
+        """Make every slot live; live slots are not changed. A slot whose physics fails in it is done at once."""
         ...
 
     def step_continuous(self, actions: npt.ArrayLike) -> Control:
-        """Advance by one tick, [B, 7], or a chunk, [B, K, 7]."""
+        """Advance by one tick, [B, 7], or a chunk, [B, K, 7]; K = 0 moves nothing and says how the slots stand."""
         ...
 
     def step_ee_pose(

@@ -6,9 +6,11 @@ and the rules about finished and quarantined slots.
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, Self, SupportsIndex, TypeVar
@@ -23,6 +25,7 @@ from vecenv.controllers.waypoint import WaypointPlan
 from vecenv.placement import Placement, PlacementError
 from vecenv.util import inputs
 
+log = logging.getLogger(__name__)
 _Kind = TypeVar("_Kind", bound=Control)
 _Result = TypeVar("_Result")
 # Tasks that ``repr`` names before it only counts them.
@@ -200,6 +203,8 @@ class SlotBatch(ABC):
     def reset(self) -> ResetInfo:
         """Make every slot live: finished slots start their episode again, live ones are not changed.
 
+        A slot whose physics fails here is done before its first tick; the log has a warning with the cause.
+
         Returns:
             Episode metadata of every slot; no observation.
         """
@@ -209,6 +214,7 @@ class SlotBatch(ABC):
             with self._stepping():
                 self._arm(stale)
             self._begin(stale)
+            self._warn_of_failed_starts(stale)
         tasks, episodes = self._placement.task, self._placement.episode
         info = ResetInfo(
             instruction=self.instructions(),
@@ -233,6 +239,12 @@ class SlotBatch(ABC):
             array[rows] = 0
         for slot in rows.tolist():
             self._fault[slot] = ""
+
+    def _warn_of_failed_starts(self, stale: np.ndarray) -> None:
+        causes = Counter(self._fault[slot] for slot in np.flatnonzero(stale) if self._fault[slot])
+        for cause, count in causes.items():
+            message = "%r: %d of %d slots failed in reset and are done before their first tick: %s"
+            log.warning(message, self, count, self.num_envs, cause)
 
     def end_episodes(self, slots: Any) -> None:
         """End the episodes of some slots: truncated, they ignore further steps and cost nothing until ``reset``.

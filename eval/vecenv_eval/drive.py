@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from vecenv.contract import BatchEnv, Control
+from vecenv.contract import ACTION_DIM, BatchEnv, Control
 from vecenv.errors import VecenvError
 from vecenv_eval.policies import Policy
 
@@ -22,6 +22,9 @@ def drive(
     env: BatchEnv, policy: Policy, refill: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> Iterator[tuple[Control, np.ndarray]]:
     """Let a policy act on a batch that was just reset, until every slot has finished.
+
+    A slot may be done already, because its physics failed in the reset. It is reported before the policy is asked, so
+    that the policy is not asked for a batch of which nothing can be seen.
 
     Args:
         env: the environment.
@@ -39,7 +42,8 @@ def drive(
     steps = np.zeros(env.num_envs, int)
     idle = 0
     while not done.all():
-        decision = policy.act(env)
+        ended_in_reset = (env.done & ~done).any()
+        decision = np.zeros((env.num_envs, 0, ACTION_DIM)) if ended_in_reset else policy.act(env)
         control = decision if isinstance(decision, Control) else env.step_continuous(decision)
         finished = control.done & ~done
         moved = finished.any() or (control.step_index[~done] > steps[~done]).any()

@@ -140,6 +140,37 @@ def test_a_faulted_episode_is_a_failure_with_its_cause(folder: Path) -> None:
     assert (result.summary.total.faults, result.summary.total.successes, result.summary.total.episodes) == (1, 9, 20)
 
 
+class Looking(Scripted):
+    """Cannot act for a batch of which no slot is live; begins single slots as well."""
+
+    def __init__(self) -> None:
+        super().__init__(self._look)
+
+    def reset_slots(self, env: BatchEnv, info: ResetInfo, slots: np.ndarray) -> None:
+        self.infos.append(info)
+
+    def _look(self, env: BatchEnv) -> np.ndarray:
+        assert not env.done.all(), "black images"
+        return np.zeros((env.num_envs, 7))
+
+
+@pytest.mark.parametrize("num_envs", [1, 2, 5])
+@pytest.mark.parametrize("refillable", [False, True])
+def test_an_episode_that_fails_in_the_reset_has_its_fault_and_the_policy_is_not_asked_for_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, num_envs: int, refillable: bool
+) -> None:
+    use_policy(monkeypatch, Looking() if refillable else Scripted(Looking()._look))
+    # All episodes of task 0, and single ones of the others.
+    faults = {(0, e): "too many contacts" for e in range(5)} | {(1, 0): "f", (2, 3): "f", (2, 4): "f"}
+    result = run(folder, FakeWorld(faults=faults, faults_in_reset=True), num_envs=num_envs)
+    assert (result.ok, result.causes, len(result.records)) == (True, (), 20)
+    for record in result.records:
+        fault = faults.get((record.task, record.episode), "")
+        solved = not fault and record.task % 2 == 0
+        assert (record.fault, record.error, record.success) == (fault, "", solved)
+        assert record.num_steps == (0 if fault else record.episode + 2 if solved else 10)
+
+
 @pytest.mark.usefixtures("in_batches")
 def test_a_batch_that_raises_costs_its_unfinished_episodes_only(folder: Path) -> None:
     result = run(folder, FakeWorld(raise_in={0: ValueError("the sky fell\nin pieces")}), num_envs=5)

@@ -391,7 +391,7 @@ def test_tasks_of_a_batch_have_as_many_episodes_as_their_lists(small: Path) -> N
     env.close()
     placement = place(MATCHING, GOOGLE, None, None)
     assert len(placement) == sum(counts[0] for task, counts in COUNTS.items() if not task.startswith("widowx"))
-    with pytest.raises(PlacementError, match="no slot to fill"):
+    with pytest.raises(PlacementError, match="5 is none of the tasks"):
         place(MATCHING, GOOGLE, [0, 1], {5: [0]})
 
 

@@ -38,13 +38,14 @@ class FakeEnv:
         max_steps: int = 10,
         faults: Mapping[tuple[int, int], str] | None = None,
         raise_in: Mapping[int, BaseException] | None = None,
+        faults_in_reset: bool = False,
     ) -> None:
         by_task = episodes if isinstance(episodes, Mapping) else dict.fromkeys(tasks, episodes)
         pairs = [(task, episode) for task in tasks for episode in by_task[task]]
         self.tasks, self.episodes = [np.array(column) for column in zip(*pairs, strict=True)]
         self.num_envs = len(self.tasks)
         self.max_steps, self.faults, self.raise_in = max_steps, faults or {}, raise_in or {}
-        self.closed, self.placements = False, 1
+        self.faults_in_reset, self.closed, self.placements = faults_in_reset, False, 1
         self.actions: list[np.ndarray] = []
         self._clear()
 
@@ -55,6 +56,8 @@ class FakeEnv:
     def reset(self) -> ResetInfo:
         done = self.done & (self.ticks > 0)
         self.ticks[done], self.terminated[done], self.truncated[done] = 0, False, False
+        if self.faults_in_reset:
+            self.truncated |= [bool(name) for name in self._fault_names()]
         pairs = list(zip(self.tasks.tolist(), self.episodes.tolist(), strict=True))
         return ResetInfo(
             instruction=tuple(f"do thing {task}" for task, _ in pairs),
@@ -172,8 +175,9 @@ class FakeWorld:
         self,
         faults: Mapping[tuple[int, int], str] | None = None,
         raise_in: Mapping[int, BaseException] | None = None,
+        faults_in_reset: bool = False,
     ) -> None:
-        self.faults, self.raise_in = faults, raise_in
+        self.faults, self.raise_in, self.faults_in_reset = faults, raise_in, faults_in_reset
         self.refuse: Exception | None = None
         self.envs: list[FakeEnv] = []
         self.suite = Suite(SUITE, tuple(f"do thing {t}" for t in range(4)), ("kitchen", "study") * 2, 5)
@@ -193,7 +197,8 @@ class FakeWorld:
         if self.refuse:
             raise self.refuse
         del backend, seed, num_threads
-        self.envs.append(FakeEnv(tasks, episodes, max_steps=max_steps, faults=self.faults, raise_in=self.raise_in))
+        given = {"faults": self.faults, "raise_in": self.raise_in, "faults_in_reset": self.faults_in_reset}
+        self.envs.append(FakeEnv(tasks, episodes, max_steps=max_steps, **given))
         return self.envs[-1]
 
     @property

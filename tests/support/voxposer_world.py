@@ -129,6 +129,11 @@ class Obedient:
         spent = self.ticks - before
         return EePoseControl(**self._flags(), converged=spent > 0, step_count=spent, error=("",) * self.num_envs)
 
+    @property
+    def done(self) -> np.ndarray:
+        flags = self._flags()
+        return flags["terminated"] | flags["truncated"]
+
     def end_episodes(self, slots: Any) -> None:
         self.ended[slots] = True
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vecenv.libero import starts as start_states
 from vecenv.libero.physics import budgets
 from vecenv.libero.physics.base import Start
 from vecenv.libero.physics.budgets import Budget, BudgetError
@@ -25,6 +26,9 @@ from vecenv.libero.tasks.suites import NUM_EPISODES
 
 # Starts of a scene on which its memory on MJX is measured.
 BUDGET_STARTS = 64
+# Which starts are measured, by how episodes begin.
+_NEEDED = {"settled": ("settled",), "raw": ("settled", "raw")}
+_KINDS = ("settled", "raw")
 
 
 def sharing(sources: Sequence[Task], key: SceneKey) -> list[Task]:
@@ -32,13 +36,23 @@ def sharing(sources: Sequence[Task], key: SceneKey) -> list[Task]:
     return [task for task in sources if task.problem().scene_key() == key]
 
 
-def measured_budget(scene: Scene, tasks: Sequence[Task]) -> Budget:
-    """Contact and constraint memory on MJX, measured on settled starts of all the tasks that share a scene.
+def measured_budget(scene: Scene, tasks: Sequence[Task], start: str = "settled") -> Budget:
+    """Contact and constraint memory on MJX, measured on starts of all the tasks that share a scene.
+
+    Args:
+        scene: the scene.
+        tasks: the tasks.
+        start: how episodes begin, as in ``LiberoConfig``. From ``"raw"`` starts things settle first, then an episode
+            goes on as from ``"settled"`` ones: it gets room for both.
 
     Raises:
         ExportError: the tasks come from an exported folder whose budgets are damaged.
     """
-    starts = _starts(scene, tasks)
+    return budgets.largest([_known(scene, tasks, _starts(scene, tasks, begun)) for begun in _NEEDED[start]])
+
+
+def _known(scene: Scene, tasks: Sequence[Task], starts: Start) -> Budget:
+    """What was measured of these starts: shipped with the tasks, remembered, or measured now."""
     first = tasks[0]
     if isinstance(first, ExportedTask):
         shipped = first.folder.budgets().get(budgets.key_of(scene, starts))
@@ -51,7 +65,7 @@ def measured_budget(scene: Scene, tasks: Sequence[Task]) -> Budget:
 
 
 def export_budgets(out: str | Path, suites: Sequence[str] | None = None, *, track: Track = untracked) -> int:
-    """Measure the scenes of an exported folder and write their budgets into it; returns how many it holds.
+    """Measure scenes of an exported folder and write their budgets into it, for any start; returns how many scenes.
 
     Args:
         out: the folder, which ``vecenv.libero.tasks.export.export`` wrote.
@@ -72,39 +86,41 @@ def export_budgets(out: str | Path, suites: Sequence[str] | None = None, *, trac
     found = dict(folder.budgets())
     for (_, scene_id), tasks in track(list(wanted.items()), "contact memory"):
         scene = folder.scene(scene_id)
-        starts = _starts(scene, tasks)
-        key = budgets.key_of(scene, starts)
-        if key not in found:
-            found[key] = asdict(budgets.cached(scene, starts))
+        for begun in _KINDS:
+            starts = _starts(scene, tasks, begun)
+            key = budgets.key_of(scene, starts)
+            if key not in found:
+                found[key] = asdict(budgets.cached(scene, starts))
     write_budgets(folder.path, found)
-    return len(found)
+    return len(wanted)
 
 
-def _starts(scene: Scene, tasks: Sequence[Task]) -> Start:
-    """Settled starts of all the tasks, fixtures at the centres of their regions."""
+def _starts(scene: Scene, tasks: Sequence[Task], begun: str) -> Start:
+    """Settled or raw starts of all the tasks, fixtures at the centres of their regions."""
     each = -(-BUDGET_STARTS // len(tasks))
     episodes = np.linspace(0, NUM_EPISODES - 1, min(each, NUM_EPISODES)).astype(int)
-    return _joined([_central_start(task, scene, episodes) for task in tasks])
+    return _joined([_central_start(task, scene, episodes, begun) for task in tasks])
 
 
-def _central_start(task: Task, scene: Scene, episodes: np.ndarray) -> Start:
-    """Settled starts of a task, fixtures at the centres of their regions."""
-    stored = task.settled()
+def _central_start(task: Task, scene: Scene, episodes: np.ndarray, begun: str) -> Start:
+    """Settled or raw starts of a task, fixtures at the centres of their regions."""
+    problem = task.problem()
+    qpos, qvel = start_states.stored(task, problem, settled=begun == "settled")
     bodies, pos, quat = fixtures.poses(
-        task.problem(), scene, "center", keys=[(0, "", 0, 0)] * len(episodes), slots=range(len(episodes))
+        problem, scene, "center", keys=[(0, "", 0, 0)] * len(episodes), slots=range(len(episodes))
     )
     return Start(
-        qpos=stored.qpos[episodes],
-        qvel=stored.qvel[episodes],
+        qpos=qpos[episodes],
+        qvel=qvel[episodes],
         bodies=bodies,
         body_pos=pos,
         body_quat=quat,
-        settled=True,
+        settled=begun == "settled",
     )
 
 
 def _joined(starts: Sequence[Start]) -> Start:
-    """Settled starts of one scene, one after the other."""
+    """Starts of one scene and one kind, one after the other."""
 
     def join(name: str) -> np.ndarray:
         return np.concatenate([getattr(start, name) for start in starts])
@@ -115,5 +131,5 @@ def _joined(starts: Sequence[Start]) -> Start:
         bodies=starts[0].bodies,
         body_pos=join("body_pos"),
         body_quat=join("body_quat"),
-        settled=True,
+        settled=starts[0].settled,
     )

@@ -169,10 +169,11 @@ class LiberoEnv(SlotBatch):
         return self._scene(key, problems, "exact")
 
     def _budget_of(self, scene_key: SceneKey, scene: Scene) -> Budget | None:
-        """Memory on MJX: as configured, or measured on the starts of all the suite's tasks in the scene."""
+        """Memory on MJX: as configured, or measured on such starts of all the suite's tasks in the scene."""
         if self.config.backend == "native" or self.config.budget is not None:
             return self.config.budget
-        return contact_memory.measured_budget(scene, contact_memory.sharing(self._sources, scene_key))
+        sharing = contact_memory.sharing(self._sources, scene_key)
+        return contact_memory.measured_budget(scene, sharing, self._rules.start)
 
     def _goal_table(self, group: Group, tasks: Mapping[int, _TaskData]) -> goals.GoalTable:
         chosen = self._placement.task[group.slots]
@@ -231,6 +232,7 @@ class LiberoEnv(SlotBatch):
 
         Args:
             actions: [B, 7] or [B, K, 7], each row dx dy dz, axis-angle rotation, gripper (+1 closes), in [-1, 1].
+                With K = 0 nothing moves, and the result says how the slots stand.
 
         Raises:
             ActionError: not numbers, or another shape.

@@ -50,7 +50,7 @@ def start_of(
         FixtureError, ResetError, SettlingError: the fixture poses cannot be had, or things do not come to rest.
     """
     problem = source.problem()
-    qpos, qvel = _stored(source, problem, rules)
+    qpos, qvel = stored(source, problem, settled=_ships_settled(rules))
     nq, nv = scene.model.nq, scene.model.nv
     if (qpos.shape[1], qvel.shape[1]) != (nq, nv):
         raise StoredStartsError(
@@ -82,9 +82,9 @@ def _ships_settled(rules: EpisodeRules) -> bool:
     return rules.start == "settled" and rules.fixtures == "center"
 
 
-def _stored(source: Task, problem: Problem, rules: EpisodeRules) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [50, nq] and velocities [50, nv] of a task's starts."""
-    if _ships_settled(rules):
+def stored(source: Task, problem: Problem, *, settled: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [50, nq] and velocities [50, nv] of a task's starts: settled ones, or the stored init states."""
+    if settled:
         starts = source.settled()
         return starts.qpos, starts.qvel
     states, free_joints = source.init_states(), len(problem.objects)

@@ -202,7 +202,8 @@ class SimplerEnv(SlotBatch):
         """Advance by one control tick, or by a chunk of K.
 
         Args:
-            actions: [B, 7] or [B, K, 7], each row dx dy dz (metres), rotation vector (radians), gripper.
+            actions: [B, 7] or [B, K, 7], each row dx dy dz (metres), rotation vector (radians), gripper. With K = 0
+                nothing moves, and the result says how the slots stand.
 
         Raises:
             ActionError: not numbers, or another shape.
@@ -210,7 +211,7 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         chunk, sanitized = action_space.continuous(actions, self.num_envs, ACTION_LIMITS)
         chunk[..., 6] = self._native_gripper(chunk[..., 6])
-        self._servo.forget(np.ones(self.num_envs, bool))
+        self._servo.forget(np.full(self.num_envs, chunk.shape[1] > 0))
         before, reward = self._steps.copy(), np.zeros(self.num_envs)
         with self._stepping():
             for tick in range(chunk.shape[1]):

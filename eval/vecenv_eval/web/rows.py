@@ -258,6 +258,8 @@ def _from_columns(values: tuple[Any, ...]) -> Mapping[str, Any]:
     """A row's values as JSON has them; text that is no JSON stays, and is refused afterwards."""
     row = dict(zip(COLUMNS, values, strict=True))
     for name, kind in COLUMNS.items():
+        if kind.startswith("BOOLEAN") and row[name] in (0, 1):  # as SQLite has it
+            row[name] = bool(row[name])
         if kind.startswith("JSON"):
             try:
                 row[name] = json.loads(row[name])

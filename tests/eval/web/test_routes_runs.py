@@ -266,7 +266,7 @@ def test_nothing_can_be_changed(client: Client, method: str) -> None:
 def test_text_from_files_is_sent_as_text(tmp_path: Path) -> None:
     bad = [
         replace(records()[0], instruction="<img src=x onerror=alert(1)>", extras={"a": "\ud800", "b": "x" * 10_000}),
-        replace(records()[1], reward=float("nan"), wall_s=float("inf"), suite='../../"><x'),
+        replace(records()[1], reward=float("nan"), suite='../../"><x'),
     ]
     folder = write_results(tmp_path / "run", [], config=CONFIG)
     plain = [json.dumps(vars(each) | {"stand_ins": [], "extras": dict(each.extras), "parts": {}}) for each in bad]

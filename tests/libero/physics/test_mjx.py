@@ -205,6 +205,18 @@ def test_a_measured_budget_has_room_for_the_starts(warp: LiberoEnv) -> None:
     assert int(np.asarray(data.nacon).max()) < SLOTS * group.built.budget.contacts  # type: ignore[attr-defined]
 
 
+@pytest.mark.heavy
+def test_episodes_of_a_published_protocol_begin_healthy() -> None:
+    """Raw starts of libero_object have things in the floor, which is more contacts than they ever have again."""
+    env = vecenv.make("libero_object", task=0, episodes=range(4), backend="warp", protocol="openpi")
+    assert isinstance(env, LiberoEnv)
+    env.reset()
+    assert (env.physics.faults, env.done.any()) == ({}, False)
+    standing = env.step_continuous(np.zeros((4, 0, 7)))
+    assert (standing.info["ticks"].tolist(), standing.info["fault"]) == ([0] * 4, ("",) * 4)
+    env.close()
+
+
 def test_worlds_share_contact_memory_when_the_share_is_known() -> None:
     budget = Budget(contacts=100, rows=30, pairs=1, candidates=120)
     assert budget.warp_sizes(3) == {"naconmax": 360, "njmax": 30}

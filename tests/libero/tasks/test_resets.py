@@ -222,7 +222,7 @@ def test_without_a_seed_fixtures_stand_as_the_protocols_seed_has_them(protocol: 
 
 @pytest.mark.parametrize("seed", [-1, MAX_SEED + 1, True, 1.5, "7"])
 def test_a_configuration_with_such_a_seed_is_refused_before_anything_is_built(seed: Any) -> None:
-    with pytest.raises(ProtocolError, match=f"integers from 0 to {MAX_SEED}"):
+    with pytest.raises((LiberoError, ProtocolError), match=rf"seed={seed!r}|integers from 0 to {MAX_SEED}"):
         LiberoConfig(fixtures="upstream", start="raw", seed=seed).rules("libero_goal")
 
 

@@ -265,6 +265,9 @@ class MjxPhysics(Physics[MjxGroup]):
         Watchers are called afterwards, in the order of the ticks.
         """
 
+        if not chunk.shape[1]:  # no program is compiled to do nothing
+            return RunResult(*(np.zeros(self.num_envs, kind) for kind in (int, bool, bool)))
+
         def call(group: MjxGroup) -> tuple[Loop, None]:
             rows = group.put(chunk[group.slots]), group.put_mask(active[group.slots]), group.put(limit[group.slots])
             with group.compiling("step", chunk.shape[1], until_success):
