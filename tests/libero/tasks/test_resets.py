@@ -14,7 +14,7 @@ from support import upstream
 from support.paths import DATA
 
 import vecenv
-from vecenv.libero.env import LiberoConfig
+from vecenv.libero.config import LiberoConfig, LiberoError
 from vecenv.libero.scene import catalog
 from vecenv.libero.scene.bddl import Problem, load_problem, parse_problem
 from vecenv.libero.scene.scene import Scene, compile_scene
