@@ -229,6 +229,41 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
     return best if _reaches(world, *best) else _put_down_leaning(world, name, target, best)
 
 
+def put_in_corner(
+    world: SceneGeometry, name: str, target: Target, middle: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
+    """Position [3] of the hand that puts an object into a corner of a box that is open to above.
+
+    Of the corners that the arm can take, it is the one that costs least, as in :func:`put_down`; of equals the one
+    farthest from the robot, so that what comes next does not have to pass over it.
+
+    Args:
+        world: the scene.
+        name: the held object.
+        target: the box to fit in.
+        middle: position of the hand, [3], where none is possible.
+        rotation: of the hand, [3, 3].
+    """
+    if target.centre is None or target.half is None or target.entry is not None:
+        return middle
+    turn = rotation @ world.hand_rotation.T
+    hung = ((world.points(name) - world.snapshot.poses[name][:3]) @ turn.T)[:, :2]
+    low, high = target.centre - target.half - hung.min(axis=0), target.centre + target.half - hung.max(axis=0)
+    inset = np.clip((high - low) / 2, 0.0, world.config.touchdown)
+    if (high < low).any():
+        return middle
+    options = []
+    for x in (low[0] + inset[0], high[0] - inset[0]):
+        for y in (low[1] + inset[1], high[1] - inset[1]):
+            at, cost = _put_down_at(world, name, target, np.array([x, y]), turn)
+            far = 0.0 if world.base is None else float(np.linalg.norm(at[:2] - world.base))
+            options.append((round(cost, 2), -far, at))
+    for _, _, at in sorted(options, key=lambda option: option[:2]):
+        if _reaches(world, at, rotation):
+            return at
+    return middle
+
+
 def _put_down_leaning(
     world: SceneGeometry, name: str, target: Target, upright_hand: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -332,13 +367,30 @@ def _put_down_at(
     resting = world.hand[2] + _rest(moved, near, target.floor, config)
     axis = (turn @ upright(world.hand_rotation))[:, 1]
     height = _with_room(np.append(middle, resting), axis, np.concatenate([near, walls]), config)
-    sits = resting - world.hand[2] + world.points(name)[:, 2].min() - target.floor
+    moved = moved + [0.0, 0.0, resting - world.hand[2]]
+    sits = max(float(moved[:, 2].min()) - target.floor, 0.0)
+    if target.half is not None and sits > config.tips_over and _tips(moved, near, config):
+        sits *= config.tipping
     cost = (
-        config.high_cost * max(sits, 0.0)
+        config.high_cost * sits
         + config.drop_cost * (height - resting)
         + _overhang(moved, target) / config.overhang_scale
     )
     return np.append(middle, height), cost
+
+
+def _tips(points: np.ndarray, obstacles: np.ndarray, config: Margins) -> bool:
+    """Whether points that were brought to rest tip over: their middle is not above what carries them."""
+    middle = points.mean(axis=0)[:2]
+    low, high = points[:, :2].min(axis=0) - config.support_radius, points[:, :2].max(axis=0) + config.support_radius
+    below = obstacles[((obstacles[:, :2] > low) & (obstacles[:, :2] < high)).all(axis=1)]
+    apart = np.linalg.norm(points[:, None, :2] - below[None, :, :2], axis=2)
+    under = np.where(apart < config.support_radius, points[:, None, 2], np.inf).min(axis=0, initial=np.inf)
+    carrying = below[(under - below[:, 2] < 2 * config.touchdown)][:, :2] - middle
+    if not len(carrying):
+        return False
+    angles = np.sort(np.arctan2(carrying[:, 1], carrying[:, 0]))
+    return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max()) > np.pi
 
 
 def _overhang(points: np.ndarray, target: Target) -> float:
