@@ -220,7 +220,8 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
     rotation = upright(world.hand_rotation) if world.hand_rotation[2, 2] < -0.98 else world.hand_rotation
     best, lowest = (world.hand, rotation), np.inf
     for angle in _turns(world, name, target, rotation):
-        for xy, cost in zip(target.xy, target.cost + abs(angle) / world.config.turn_scale, strict=True):
+        places, costs = _with_corners(world, name, target, spun(np.eye(3), angle))
+        for xy, cost in zip(places, costs + abs(angle) / world.config.turn_scale, strict=True):
             if cost >= lowest:  # costs ascend and nothing makes them less
                 break
             end, extra = _put_down_at(world, name, target, xy, spun(np.eye(3), angle))
@@ -247,21 +248,41 @@ def put_in_corner(
     if target.centre is None or target.half is None or target.entry is not None:
         return middle
     turn = rotation @ world.hand_rotation.T
-    hung = ((world.points(name) - world.snapshot.poses[name][:3]) @ turn.T)[:, :2]
-    low, high = target.centre - target.half - hung.min(axis=0), target.centre + target.half - hung.max(axis=0)
-    inset = np.clip((high - low) / 2, 0.0, world.config.touchdown)
-    if (high < low).any():
-        return middle
     options = []
-    for x in (low[0] + inset[0], high[0] - inset[0]):
-        for y in (low[1] + inset[1], high[1] - inset[1]):
-            at, cost = _put_down_at(world, name, target, np.array([x, y]), turn)
-            far = 0.0 if world.base is None else float(np.linalg.norm(at[:2] - world.base))
-            options.append((round(cost, 2), -far, at))
+    for corner in _corners(world, name, target, turn):
+        at, cost = _put_down_at(world, name, target, corner, turn)
+        far = 0.0 if world.base is None else float(np.linalg.norm(at[:2] - world.base))
+        options.append((round(cost, 2), -far, at))
     for _, _, at in sorted(options, key=lambda option: option[:2]):
         if _reaches(world, at, rotation):
             return at
     return middle
+
+
+def _corners(world: SceneGeometry, name: str, target: Target, turn: np.ndarray) -> np.ndarray:
+    """Places of an object's origin, turned by ``turn`` [3, 3], in the corners of a box, [4, 2]; [0, 2] if none fits."""
+    if target.centre is None or target.half is None:
+        return np.zeros((0, 2))
+    hung = ((world.points(name) - world.snapshot.poses[name][:3]) @ turn.T)[:, :2]
+    low, high = target.centre - target.half - hung.min(axis=0), target.centre + target.half - hung.max(axis=0)
+    if (high < low).any():
+        return np.zeros((0, 2))
+    inset = np.clip((high - low) / 2, 0.0, world.config.touchdown)
+    ends = np.stack([low + inset, high - inset])
+    return np.stack([ends[[0, 0, 1, 1], 0], ends[[0, 1, 0, 1], 1]], axis=1)
+
+
+def _with_corners(
+    world: SceneGeometry, name: str, target: Target, turn: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The candidates of a target with the corners of its box, [M, 2], and what each costs, ascending, [M]."""
+    corners = _corners(world, name, target, turn)
+    if not len(corners):
+        return target.xy, target.cost
+    far = np.linalg.norm(corners - target.xy[0], axis=1) / world.config.aside_scale
+    places, costs = np.concatenate([target.xy, corners]), np.concatenate([target.cost, far])
+    order = np.argsort(costs, kind="stable")
+    return places[order], costs[order]
 
 
 def _put_down_leaning(
@@ -389,8 +410,9 @@ def _tips(points: np.ndarray, obstacles: np.ndarray, config: Margins) -> bool:
     carrying = below[(under - below[:, 2] < 2 * config.touchdown)][:, :2] - middle
     if not len(carrying):
         return False
-    angles = np.sort(np.arctan2(carrying[:, 1], carrying[:, 0]))
-    return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max()) > np.pi
+    headings = np.arange(24) * np.pi / 12
+    ahead = carrying @ np.stack([np.cos(headings), np.sin(headings)])
+    return float(ahead.max(axis=0).min()) < -config.touchdown
 
 
 def _overhang(points: np.ndarray, target: Target) -> float:

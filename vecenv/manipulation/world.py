@@ -43,6 +43,7 @@ class Margins:
         high_cost: cost per metre of coming to rest higher than the target's floor, on something else.
         tips_over: an object that rests this much higher than a container's floor may tip over into it.
         tipping: share of that cost where it does, because its middle is not above what carries it.
+        aside_scale: distance from the middle of a container that costs one point.
         drop_cost: cost per metre of releasing above the height of rest because the hand has no room.
         widest_turn: hands turn no further than this from home, radians.
         overhang_scale: sticking out this much of a box to fit in costs one point.
@@ -75,7 +76,8 @@ class Margins:
     support_radius: float = 0.008
     high_cost: float = 40.0
     tips_over: float = 0.02
-    tipping: float = 0.5
+    tipping: float = 0.25
+    aside_scale: float = 0.02
     drop_cost: float = 10.0
     widest_turn: float = 1.75
     overhang_scale: float = 0.005
