@@ -272,9 +272,7 @@ def _corners(world: SceneGeometry, name: str, target: Target, turn: np.ndarray) 
     return np.stack([ends[[0, 0, 1, 1], 0], ends[[0, 1, 0, 1], 1]], axis=1)
 
 
-def _with_corners(
-    world: SceneGeometry, name: str, target: Target, turn: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _with_corners(world: SceneGeometry, name: str, target: Target, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The candidates of a target with the corners of its box, [M, 2], and what each costs, ascending, [M]."""
     corners = _corners(world, name, target, turn)
     if not len(corners):
@@ -390,14 +388,24 @@ def _put_down_at(
     height = _with_room(np.append(middle, resting), axis, np.concatenate([near, walls]), config)
     moved = moved + [0.0, 0.0, resting - world.hand[2]]
     sits = max(float(moved[:, 2].min()) - target.floor, 0.0)
-    if target.half is not None and sits > config.tips_over and _tips(moved, near, config):
-        sits *= config.tipping
     cost = (
-        config.high_cost * sits
+        _height_cost(sits, moved, near, config, contained=target.half is not None)
         + config.drop_cost * (height - resting)
         + _overhang(moved, target) / config.overhang_scale
     )
     return np.append(middle, height), cost
+
+
+def _height_cost(sits: float, points: np.ndarray, obstacles: np.ndarray, config: Margins, *, contained: bool) -> float:
+    """What it costs that an object comes to rest so high over the floor of its target, metres.
+
+    In a container it stands beside other things if it can, else it tips over into what room there is.
+    """
+    if not contained or sits <= config.stacked:
+        return config.high_cost * sits
+    if _tips(points, obstacles, config):
+        return config.tipped_cost
+    return config.stacked_cost + config.high_cost * sits
 
 
 def _tips(points: np.ndarray, obstacles: np.ndarray, config: Margins) -> bool:
