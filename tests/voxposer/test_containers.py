@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.voxposer_world import HOME, box, snapshot, space
+from support.voxposer_world import HOME, box, snapshot
 
 from vecenv.manipulation.grasps import Gripper
 from vecenv.manipulation.placing import Target, put_down, put_in_corner
 from vecenv.manipulation.world import Margins, SceneGeometry, matrix
-from vecenv.observations import ObjectsSnapshot
+from vecenv.observations import ObjectsSnapshot, Part, RegionBox
 from voxposer.offline.map_writer import write_affordance, write_rotation
 from voxposer.offline.planner_writer import write_planner
 from voxposer.perception.config import HandState
@@ -78,10 +78,9 @@ def test_an_object_without_room_on_the_floor_goes_where_it_tips_over() -> None:
 
 def test_the_corner_is_a_field_of_a_container() -> None:
     basket = box((0.07, 0.07, 0.004), (0.0, 0.2, 0.004))
-    seen = replace(
-        carrying((0.03, 0.02, 0.05), basket_1=basket),
-        parts={"basket_1_inside": space((0.0, 0.2, 0.05), (0.06, 0.06, 0.05))},
-    )
+    region = RegionBox(np.array([0.0, 0.2, 0.05]), np.eye(3), np.array([0.06, 0.06, 0.05]), "basket_1")
+    parts = {"basket_1_inside": Part("basket_1", "space", basket, region)}
+    seen = replace(carrying((0.03, 0.02, 0.05), basket_1=basket), parts=parts)
     view = Perception(seen, HandState(seen.ee_pose, HOME, closed=True))
     assert view.held == "held_1"
     seen_basket = view.detect("basket_1")
