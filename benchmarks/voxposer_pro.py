@@ -49,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suites", default=",".join(SUITES))
     parser.add_argument("--tasks", default=f"0-{TASKS - 1}", help="indices and ranges: 0,3,5-7")
-    parser.add_argument("--episodes", default="0-9")
+    parser.add_argument("--episodes", default="0-9", help="of each task: all, 5 for the first five, or 0,3,5-7")
     parser.add_argument("--num-envs", type=int, default=10, help="episodes at once in a process")
     parser.add_argument("--jobs", type=int, default=1, help="processes side by side, about 1.5 GB each")
     parser.add_argument("--scenes", default="", help="folder of scenes that vecenv compile wrote")
@@ -69,7 +69,7 @@ def main() -> None:
     causes = [] if options.report else run(jobs, options.jobs)
     rows, failures = rows_of(jobs)
     if not rows:
-        raise SystemExit(f"{options.work}: no episodes of these suites yet")
+        raise SystemExit("\n".join([f"{options.work}: no episodes of these suites yet", *causes]))
     notes = {"privileged": PRIVILEGED, "not run": causes, "failures": failures}
     report("voxposer_pro", rows, title="VoxPoser (offline/libero) on LIBERO-PRO", notes=notes)
     if causes:

@@ -105,7 +105,7 @@ def plan_mapped(
     for _ in range(_REPLANS + 1):
         value = cost_to_go(price, maps.lattices[0].step, maps.end, maps.start)
         found = _followed(perception, maps, value, planner, np.clip((price - 1) / route.hit_price, 0, 1))
-        beyond = _out_of_reach(perception, found, *maps.rotations)
+        found, beyond = _turned_within_reach(perception, found, maps, route)
         if not len(beyond):
             break
         price = price + route.hit_price * _near_any(maps.lattices[0], beyond)
@@ -124,6 +124,7 @@ class _Maps:
         goal: position of the goal, [3].
         zone: where the hand has the start's rotation, and the start's lattice counts, bool [X, Y, Z].
         room: around hand and load, metres, float32 [X, Y, Z].
+        either: the same with the start's rotation and with the goal's, each everywhere.
         price: of a metre, float32 [X, Y, Z].
     """
 
@@ -134,6 +135,7 @@ class _Maps:
     goal: np.ndarray
     zone: np.ndarray
     room: np.ndarray
+    either: tuple[np.ndarray, np.ndarray]
     price: np.ndarray
 
 
@@ -175,6 +177,7 @@ def _maps(
         goal=there[0],
         zone=zone,
         room=np.where(zone, leaving, coming),
+        either=(leaving, coming),
         price=np.where(zone, leave, come),
     )
 
@@ -191,22 +194,56 @@ def _voxel(perception: Perception) -> np.ndarray:
     return (grid.hi - grid.lo) / (grid.size - 1)
 
 
-def _out_of_reach(perception: Perception, found: MappedPath, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Positions on a path that the arm cannot take, its ends left out, [K, 3]; none for an arm that is not known.
+def _turned_within_reach(
+    perception: Perception, found: MappedPath, maps: _Maps, route: RouteConfig
+) -> tuple[MappedPath, np.ndarray]:
+    """A path on which the hand turns where the arm can, and where there is room; and what it still cannot take.
+
+    Returns:
+        The path, and the positions on it that the arm cannot take, its ends left out, [K, 3]; none for an arm that is
+        not known.
 
     Raises:
         OutOfReach: the arm cannot take the goal.
     """
     base = perception.snapshot.panda_base
     if base is None:
-        return np.zeros((0, 3))
-    way = perception.grid.world(found.path)
+        return found, np.zeros((0, 3))
+    way, arm = perception.grid.world(found.path), PandaArm(base)
+    first, last = maps.rotations
     turned = np.where((np.arange(len(way)) < found.turn)[:, None, None], first, last)
-    reached = PandaArm(base).reaches(way, turned)
+    reached = arm.reaches(way, turned)
     if not reached[-1]:
         at = ", ".join(f"{x:.2f}" for x in way[-1])
         raise OutOfReach(f"the arm has no joint angles for the goal of a motion, the hand at {at}")
-    return way[1:-1][~reached[1:-1]]
+    if not reached.all():
+        lacks = [~arm.reaches(way, np.broadcast_to(rotation, (len(way), 3, 3))) for rotation in (first, last)]
+        turn = _best_turn(found, maps, lacks, route)
+        found, reached = replace(found, turn=turn), ~np.where(np.arange(len(way)) < turn, *lacks)
+    return found, way[1:-1][~reached[1:-1]]
+
+
+def _best_turn(found: MappedPath, maps: _Maps, lacks: list[np.ndarray], route: RouteConfig) -> int:
+    """The waypoint nearest to a path's turn at which the arm misses the fewest waypoints when the hand turns there.
+
+    Args:
+        found: the path, over P waypoints.
+        maps: of the motion.
+        lacks: which waypoints it cannot take with the start's rotation and with the goal's, bool [P] each.
+        route: how much room is needed to turn.
+    """
+    shape = np.array(maps.room.shape)
+    nodes = np.clip(np.round(found.path / [1, 1, _LAYERS]), 0, shape - 1).astype(int)
+    cramped = [room[tuple(nodes.T)] < route.turning for room in maps.either]
+    best, least = found.turn, np.inf
+    for turn in sorted(range(len(nodes)), key=lambda turn: abs(turn - found.turn)):
+        # What would be passed with the other rotation than planned needs room for it.
+        if cramped[0][found.turn : turn].any() or cramped[1][turn : found.turn].any():
+            continue
+        missed = int(lacks[0][:turn].sum() + lacks[1][turn:].sum())
+        if missed < least:
+            best, least = turn, missed
+    return best
 
 
 def _within_reach(perception: Perception, goal: Stop, most: float, *, level: bool = False) -> Stop:

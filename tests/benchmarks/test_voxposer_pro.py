@@ -73,3 +73,10 @@ def test_an_empty_folder_is_no_report(tmp_path: Path) -> None:
     run = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert run.returncode == 1
     assert "no episodes of these suites yet" in run.stderr
+
+
+def test_where_nothing_was_run_the_causes_are_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(voxposer_pro, "run", lambda jobs, processes: [f"{jobs[0].suite}/0: episodes='0': no episode"])
+    monkeypatch.setattr(sys, "argv", ["voxposer_pro.py", "--episodes", "0", "--work", str(tmp_path)])
+    with pytest.raises(SystemExit, match="no episodes of these suites yet\nlibero_spatial_lan/0: episodes='0'"):
+        voxposer_pro.main()

@@ -185,6 +185,7 @@ class ToyWorld:
                 "grasp_quat": lambda: DOWN.copy(),
                 "place_position": lambda: self.voxel(self._rest(name) + self._under()),
                 "place_quat": lambda: DOWN.copy(),
+                "corner_position": lambda: self.voxel(self._rest(name) + self._under()),
                 "push_quat": lambda: DOWN.copy(),
                 "hand_offset": lambda: self.voxel(self.ee) - self.voxel(self.ee - self._under()),
                 "normal": lambda: np.array([0.0, 0.0, 1.0]),

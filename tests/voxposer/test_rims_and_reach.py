@@ -16,12 +16,13 @@ from vecenv.manipulation.placing import Target, choose_grasp, put_down
 from vecenv.manipulation.reach import PandaArm
 from vecenv.manipulation.rims import RimConfig, find_rim_grasps
 from vecenv.manipulation.routes import RouteConfig, Stop
-from vecenv.manipulation.world import Margins, SceneGeometry
+from vecenv.manipulation.world import HOME_ROTATION, Margins, SceneGeometry, leaning
 from vecenv.observations import ObjectsSnapshot, PointCloud
 from voxposer.mapped import OutOfReach, plan_mapped
 from voxposer.perception.config import HandState
 from voxposer.perception.view import Perception
 from voxposer.planning.config import PlannerConfig
+from voxposer.quaternions import quaternion
 
 BASE = np.array([-0.6, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 PINCHERS = Gripper(wrist=0.14)
@@ -171,6 +172,23 @@ def test_a_place_out_of_reach_gives_way_on_its_level() -> None:
         goal_of(view, (reach + 0.12, 0.0, 0.12), exact=True, closed=True)
 
 
+def test_a_hand_turns_where_the_arm_can_take_its_rotation() -> None:
+    """From upright near the robot to leaning at the end of the reach, and back."""
+    far, near, arm = (0.22, 0.0, 0.2), (-0.1, 0.0, 0.25), PandaArm(BASE)
+    lean = leaning(0.5) @ HOME_ROTATION
+    assert arm.reaches(np.array([far]), lean[None])[0]
+    assert not arm.reaches(np.array([far]), HOME_ROTATION[None])[0]
+    options = {"avoidance": None, "planner": PlannerConfig(), "route": RouteConfig()}
+    for start, first, end, last in ((near, HOME_ROTATION, far, lean), (far, lean, near, HOME_ROTATION)):
+        seen = snapshot({}, panda_base=BASE, ee_pose=np.array([*start, *quaternion(first)]))
+        view = Perception(seen, HandState(seen.ee_pose, HOME, closed=False))
+        goal = Stop(np.array(end), quaternion(last), False)
+        found = plan_mapped(view, goal, closed=False, **options)  # pyright: ignore[reportArgumentType]
+        way = view.grid.world(found.path)
+        turned = np.where((np.arange(len(way)) < found.turn)[:, None, None], first, last)
+        assert arm.reaches(way, turned).all()
+
+
 # -- in LIBERO-PRO -----------------------------------------------------------------------------------------------------
 
 
@@ -181,6 +199,8 @@ def test_a_place_out_of_reach_gives_way_on_its_level() -> None:
         ("libero_goal_task", 1),  # a plate, by its rim
         ("libero_10_swap", 0),  # over a can next to the robot's base
         ("libero_spatial_task", 0),  # "not between"
+        ("libero_10_object", 7),  # a larger can and a box in one basket
+        ("libero_10_task", 7),  # a bottle and a box in one basket
     ],
 )
 def test_tasks_that_need_these_rules_are_solved(suite: str, task: int, tmp_path: Path) -> None:

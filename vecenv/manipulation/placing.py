@@ -220,13 +220,67 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
     rotation = upright(world.hand_rotation) if world.hand_rotation[2, 2] < -0.98 else world.hand_rotation
     best, lowest = (world.hand, rotation), np.inf
     for angle in _turns(world, name, target, rotation):
-        for xy, cost in zip(target.xy, target.cost + abs(angle) / world.config.turn_scale, strict=True):
+        places, costs = _with_corners(world, name, target, spun(np.eye(3), angle))
+        for xy, cost in zip(places, costs + abs(angle) / world.config.turn_scale, strict=True):
             if cost >= lowest:  # costs ascend and nothing makes them less
                 break
             end, extra = _put_down_at(world, name, target, xy, spun(np.eye(3), angle))
             if cost + extra < lowest:
                 best, lowest = (end, spun(rotation, angle)), cost + extra
     return best if _reaches(world, *best) else _put_down_leaning(world, name, target, best)
+
+
+def put_in_corner(
+    world: SceneGeometry, name: str, target: Target, middle: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
+    """Position [3] of the hand that puts an object into a corner of a box that is open to above.
+
+    Of the corners that the arm can take, it is the one that costs least, as in :func:`put_down`; of equals the one
+    farthest from the robot, so that what comes next does not have to pass over it.
+
+    Args:
+        world: the scene.
+        name: the held object.
+        target: the box to fit in.
+        middle: position of the hand, [3], where none is possible.
+        rotation: of the hand, [3, 3].
+    """
+    if target.centre is None or target.half is None or target.entry is not None:
+        return middle
+    turn = rotation @ world.hand_rotation.T
+    options = []
+    for corner in _corners(world, name, target, turn):
+        at, cost = _put_down_at(world, name, target, corner, turn)
+        far = 0.0 if world.base is None else float(np.linalg.norm(at[:2] - world.base))
+        options.append((round(cost, 2), -far, at))
+    for _, _, at in sorted(options, key=lambda option: option[:2]):
+        if _reaches(world, at, rotation):
+            return at
+    return middle
+
+
+def _corners(world: SceneGeometry, name: str, target: Target, turn: np.ndarray) -> np.ndarray:
+    """Places of an object's origin, turned by ``turn`` [3, 3], in the corners of a box, [4, 2]; [0, 2] if none fits."""
+    if target.centre is None or target.half is None:
+        return np.zeros((0, 2))
+    hung = ((world.points(name) - world.snapshot.poses[name][:3]) @ turn.T)[:, :2]
+    low, high = target.centre - target.half - hung.min(axis=0), target.centre + target.half - hung.max(axis=0)
+    if (high < low).any():
+        return np.zeros((0, 2))
+    inset = np.clip((high - low) / 2, 0.0, world.config.touchdown)
+    ends = np.stack([low + inset, high - inset])
+    return np.stack([ends[[0, 0, 1, 1], 0], ends[[0, 1, 0, 1], 1]], axis=1)
+
+
+def _with_corners(world: SceneGeometry, name: str, target: Target, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The candidates of a target with the corners of its box, [M, 2], and what each costs, ascending, [M]."""
+    corners = _corners(world, name, target, turn)
+    if not len(corners):
+        return target.xy, target.cost
+    far = np.linalg.norm(corners - target.xy[0], axis=1) / world.config.aside_scale
+    places, costs = np.concatenate([target.xy, corners]), np.concatenate([target.cost, far])
+    order = np.argsort(costs, kind="stable")
+    return places[order], costs[order]
 
 
 def _put_down_leaning(
@@ -332,13 +386,41 @@ def _put_down_at(
     resting = world.hand[2] + _rest(moved, near, target.floor, config)
     axis = (turn @ upright(world.hand_rotation))[:, 1]
     height = _with_room(np.append(middle, resting), axis, np.concatenate([near, walls]), config)
-    sits = resting - world.hand[2] + world.points(name)[:, 2].min() - target.floor
+    moved = moved + [0.0, 0.0, resting - world.hand[2]]
+    sits = max(float(moved[:, 2].min()) - target.floor, 0.0)
     cost = (
-        config.high_cost * max(sits, 0.0)
+        _height_cost(sits, moved, near, config, contained=target.half is not None)
         + config.drop_cost * (height - resting)
         + _overhang(moved, target) / config.overhang_scale
     )
     return np.append(middle, height), cost
+
+
+def _height_cost(sits: float, points: np.ndarray, obstacles: np.ndarray, config: Margins, *, contained: bool) -> float:
+    """What it costs that an object comes to rest so high over the floor of its target, metres.
+
+    In a container it stands beside other things if it can, else it tips over into what room there is.
+    """
+    if not contained or sits <= config.stacked:
+        return config.high_cost * sits
+    if _tips(points, obstacles, config):
+        return config.tipped_cost
+    return config.stacked_cost + config.high_cost * sits
+
+
+def _tips(points: np.ndarray, obstacles: np.ndarray, config: Margins) -> bool:
+    """Whether points that were brought to rest tip over: their middle is not above what carries them."""
+    middle = points.mean(axis=0)[:2]
+    low, high = points[:, :2].min(axis=0) - config.support_radius, points[:, :2].max(axis=0) + config.support_radius
+    below = obstacles[((obstacles[:, :2] > low) & (obstacles[:, :2] < high)).all(axis=1)]
+    apart = np.linalg.norm(points[:, None, :2] - below[None, :, :2], axis=2)
+    under = np.where(apart < config.support_radius, points[:, None, 2], np.inf).min(axis=0, initial=np.inf)
+    carrying = below[(under - below[:, 2] < 2 * config.touchdown)][:, :2] - middle
+    if not len(carrying):
+        return False
+    headings = np.arange(24) * np.pi / 12
+    ahead = carrying @ np.stack([np.cos(headings), np.sin(headings)])
+    return float(ahead.max(axis=0).min()) < -config.touchdown
 
 
 def _overhang(points: np.ndarray, target: Target) -> float:

@@ -41,6 +41,10 @@ class Margins:
         touchdown: gap left under an object when it is released.
         support_radius: points this close horizontally rest on one another.
         high_cost: cost per metre of coming to rest higher than the target's floor, on something else.
+        stacked: what comes to rest this much higher than a container's floor stands on something else in it.
+        stacked_cost: cost of that in addition.
+        tipped_cost: cost instead, where it tips over because its middle is not above what carries it.
+        aside_scale: distance from the middle of a container that costs one point.
         drop_cost: cost per metre of releasing above the height of rest because the hand has no room.
         widest_turn: hands turn no further than this from home, radians.
         overhang_scale: sticking out this much of a box to fit in costs one point.
@@ -72,6 +76,10 @@ class Margins:
     touchdown: float = 0.004
     support_radius: float = 0.008
     high_cost: float = 40.0
+    stacked: float = 0.02
+    stacked_cost: float = 6.0
+    tipped_cost: float = 4.0
+    aside_scale: float = 0.02
     drop_cost: float = 10.0
     widest_turn: float = 1.75
     overhang_scale: float = 0.005

@@ -26,13 +26,14 @@ def _grasp_point(match: Groups) -> list[str]:
 
 
 def _place_point(match: Groups) -> list[str]:
-    name = variable(match["thing"])
-    lines = [get(match["thing"]), f"x, y, z = {name}.place_position"]
-    if not match["half"]:
+    name, half = variable(match["thing"]), match["half"].lower().removesuffix(" side")
+    field = "corner_position" if half == "corner" else "place_position"
+    lines = [get(match["thing"]), f"x, y, z = {name}.{field}"]
+    if half not in {"left", "right"}:
         return lines
-    way = "-" if match["half"].lower() == "left" else "+"
+    way = "-" if half == "left" else "+"
     quarter = f"({name}.aabb[1][1] - {name}.aabb[0][1]) / 4"
-    return [*lines, f"# the middle of its {match['half']} half", f"y = y {way} {quarter}"]
+    return [*lines, f"# the middle of its {half} half", f"y = y {way} {quarter}"]
 
 
 def _above_point(match: Groups) -> list[str]:
@@ -159,7 +160,7 @@ def _middle(match: Groups) -> list[str]:
 
 
 _SIDE = "|".join(SIDES)
-_HALF = r"(?:the (?P<half>left|right) side of )?"
+_HALF = r"(?:the (?P<half>left side|right side|corner) of )?"
 _POINTS: Rules = (
     (rf"the grasp position of {THING}", _grasp_point),
     (rf"the place position of {_HALF}{THING}", _place_point),

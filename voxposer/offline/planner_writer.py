@@ -319,7 +319,8 @@ class _Planner:
             if place.relation == "between":
                 goal = _goal(place, self._between(place))
             else:
-                words = self._half(action.place) + self._place(place, action.thing)
+                where = self._place(place, action.thing)
+                words = self._half(action.place, place.relation, where) + where
                 goal = _goal(place, words, self._arrived_at(place, action.thing, words))
             blocks.append(Block((*_lifted(thing), *goal), thing))
         self._moves.add(ground(action.thing, self._names), place)
@@ -359,12 +360,23 @@ class _Planner:
             raise NotUnderstood(f"between {found[0].text} and itself is no place")
         return " and ".join(self._single(one) for one in found)
 
-    def _half(self, place: Place) -> str:
-        """The half of a flat place for the next object, where two are to stand on it."""
-        if self._arrivals[place] != 2 or place.relation not in {"on", "top_of"}:
+    def _half(self, place: Place, relation: str, words: str) -> str:
+        """The half of a flat place for the next object, where two are to stand on it; a corner for the first of two
+        that are to be in something.
+
+        Args:
+            place: as it was said.
+            relation: as it is meant.
+            words: for the place.
+        """
+        inside = relation == "in" and not words.endswith(("_inside", "_level"))
+        if self._arrivals[place] != 2 or not (inside or place.relation in {"on", "top_of"}):
             return ""
         self._arrived[place] = self._arrived.get(place, 0) + 1
-        return f"the {'left' if self._arrived[place] == 1 else 'right'} side of "
+        first = self._arrived[place] == 1
+        if inside:
+            return "the corner of " if first else ""
+        return f"the {'left' if first else 'right'} side of "
 
     def _push(self, action: Action) -> list[Block]:
         assert action.place is not None

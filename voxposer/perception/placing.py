@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vecenv.manipulation.placing import Target, put_down
+from vecenv.manipulation.placing import Target, put_down, put_in_corner
 from vecenv.manipulation.world import SceneGeometry, upright
 from vecenv.observations import Part
 from voxposer.perception.config import PerceptionConfig
@@ -34,6 +34,15 @@ class PlaceFinder:
             top = np.append((points.min(axis=0) + points.max(axis=0))[:2] / 2, points[:, 2].max() + self.config.above)
             return HandPose(top, rotation)
         return HandPose(*put_down(self.scene, held, target))
+
+    def corner(self, target: Target | None, held: str, middle: HandPose) -> HandPose:
+        """Pose of the hand that puts the held object into a corner of a container, rotated as in its middle.
+
+        So much room is left for others. The same pose where there is no container or no corner.
+        """
+        if self.config.fields == "centroid" or target is None or not held:
+            return middle
+        return HandPose(put_in_corner(self.scene, held, target, middle.pos, middle.rotation), middle.rotation)
 
     def of_object(self, name: str) -> Target | None:
         """Target for a whole object: its only space, else its only top, else the object itself."""

@@ -241,6 +241,7 @@ class Perception:
             grasp, place = self._centroid_fields(points)
         else:
             place = functools.partial(self._place_finder.pose, points, target, self.held)
+        corner = functools.partial(self._place_finder.corner, target, self.held)
 
         later: dict[str, Callable[[], Any]] = {
             "occupancy_map": lambda: self.grid.occupancy(points).astype(float),
@@ -248,6 +249,7 @@ class Perception:
             "grasp_quat": lambda: quaternion(_once(self._grasps, name, grasp).rotation),
             "place_position": lambda: self._remember_voxel(_once(self._places, name, place)),
             "place_quat": lambda: quaternion(_once(self._places, name, place).rotation),
+            "corner_position": lambda: self._remember_voxel(corner(_once(self._places, name, place))),
         }
         return LazyObservation(values, later)
 

@@ -1,0 +1,107 @@
+"""Two things for one container: the first goes into a corner, the second where it has room or tips over into it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.voxposer_world import HOME, box, snapshot
+
+from vecenv.manipulation.grasps import Gripper
+from vecenv.manipulation.placing import Target, put_down, put_in_corner
+from vecenv.manipulation.world import Margins, SceneGeometry, matrix
+from vecenv.observations import ObjectsSnapshot, Part, RegionBox
+from voxposer.offline.map_writer import write_affordance, write_rotation
+from voxposer.offline.planner_writer import write_planner
+from voxposer.perception.config import HandState
+from voxposer.perception.view import Perception
+
+BASE = np.array([-0.6, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+CENTRE, HALF = np.array([0.0, 0.2]), np.array([0.06, 0.06])
+DOWN = matrix(HOME[3:])
+
+
+def carrying(half: tuple[float, float, float], **others: object) -> ObjectsSnapshot:
+    """A block in the hand at 0, 0, between closed pads."""
+    held = box(half, (0.0, 0.0, 0.3))
+    seen = snapshot({"held_1": held, **others}, panda_base=BASE)  # pyright: ignore[reportArgumentType]
+    pose, width = np.array([0.0, 0.0, 0.3, *HOME[3:]]), half[1]
+    return replace(seen, ee_pose=pose, gripper=np.array([width, -width]))
+
+
+def scene(seen: ObjectsSnapshot) -> SceneGeometry:
+    return SceneGeometry(seen, Margins(gripper=Gripper(wrist=0.14)), BASE[:2])
+
+
+def inside() -> Target:
+    return Target(CENTRE[None], np.zeros(1), floor=0.0, centre=CENTRE, half=HALF)
+
+
+def test_a_corner_is_as_far_from_the_middle_as_the_object_fits() -> None:
+    world = scene(carrying((0.03, 0.02, 0.05)))
+    middle, rotation = put_down(world, "held_1", inside())
+    np.testing.assert_allclose(middle[:2], CENTRE, atol=1e-3)
+    at = put_in_corner(world, "held_1", inside(), middle, rotation)
+    np.testing.assert_allclose(np.abs(at[:2] - CENTRE), HALF - [0.03, 0.02], atol=0.006)
+    assert (np.abs(at[:2] - CENTRE) + [0.03, 0.02] <= HALF).all()
+    assert (at[:2] > CENTRE).all()  # the corner farthest from the robot
+    assert at[2] == pytest.approx(middle[2], abs=1e-6)
+
+
+def test_what_is_too_wide_for_a_corner_stays_in_the_middle() -> None:
+    world = scene(carrying((0.03, 0.02, 0.05)))
+    narrow = replace(inside(), half=np.array([0.02, 0.06]))
+    middle = np.array([0.0, 0.2, 0.1])
+    assert put_in_corner(world, "held_1", narrow, middle, DOWN) is middle
+    on_top = Target(CENTRE[None], np.zeros(1), floor=0.0)
+    assert put_in_corner(world, "held_1", on_top, middle, DOWN) is middle
+
+
+def test_the_second_object_stands_beside_one_in_a_corner() -> None:
+    first = box((0.03, 0.03, 0.03), (0.03, 0.23, 0.03))
+    world = scene(carrying((0.025, 0.02, 0.05), first_1=first))
+    pos, _ = put_down(world, "held_1", inside())
+    free = np.abs(pos[:2] - [0.03, 0.23]) - [0.055, 0.05]
+    assert free.max() > -0.002  # apart along an axis
+    assert pos[2] - 0.05 < 0.02  # on the floor
+
+
+def test_an_object_without_room_on_the_floor_goes_where_it_tips_over() -> None:
+    """Most of the floor is taken: in the middle it would stand on the other, at the side it falls in."""
+    first = box((0.045, 0.045, 0.05), (0.014, 0.214, 0.05), 2000)
+    world = scene(carrying((0.03, 0.02, 0.01), first_1=first))
+    pos, _ = put_down(world, "held_1", inside())
+    over = np.abs(pos[:2] - [0.014, 0.214]) - 0.045
+    assert over.max() > 0.0  # its middle is not above the other
+
+
+def test_the_corner_is_a_field_of_a_container() -> None:
+    basket = box((0.07, 0.07, 0.004), (0.0, 0.2, 0.004))
+    region = RegionBox(np.array([0.0, 0.2, 0.05]), np.eye(3), np.array([0.06, 0.06, 0.05]), "basket_1")
+    parts = {"basket_1_inside": Part("basket_1", "space", basket, region)}
+    seen = replace(carrying((0.03, 0.02, 0.05), basket_1=basket), parts=parts)
+    view = Perception(seen, HandState(seen.ee_pose, HOME, closed=True))
+    assert view.held == "held_1"
+    seen_basket = view.detect("basket_1")
+    corner = view.position_of(seen_basket.corner_position)
+    place = view.position_of(seen_basket.place_position)
+    assert np.abs(corner[:2] - place[:2]).min() > 0.02
+    table = view.detect("table")
+    assert (table.corner_position == table.place_position).all()
+
+
+def test_the_first_of_two_things_is_put_into_the_corner() -> None:
+    names = ["soup_1", "sauce_1", "basket_1", "basket_1_inside"]
+    program = write_planner("put both the soup and the sauce in the basket", names)
+    placed = [line for line in program.splitlines() if "place it" in line]
+    assert ["corner of" in line for line in placed] == [True, False]
+    single = write_planner("put the soup in the basket", names)
+    assert "corner" not in single
+
+
+def test_map_programs_know_the_corner() -> None:
+    asked = "a point 10cm above the place position of the corner of the basket_1"
+    assert "basket.corner_position" in write_affordance(asked)
+    assert "basket.place_position" in write_affordance(asked.replace("the corner of ", ""))
+    assert "basket.place_quat" in write_rotation("the placing orientation of the corner of the basket_1")
