@@ -143,6 +143,7 @@ class CameraRig:
                 height=self.config.height,
                 width=self.config.width,
                 num_threads=self.config.num_threads,
+                num_processes=self.config.num_processes,
                 gl=self.config.gl,
             )
         return self._renderer

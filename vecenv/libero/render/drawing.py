@@ -145,6 +145,7 @@ class Stage(Viewpoints):
 
     Attributes:
         model: the visual model.
+        scene, grid: as given.
         instances: the names that segmentation images index; "" (index 0) is everything else: table, floor, walls.
         boxes: the bounding boxes of its items.
         has_shadows: whether a light casts shadows.
@@ -152,10 +153,9 @@ class Stage(Viewpoints):
 
     def __init__(self, scene: Scene, grid: float = 0.0) -> None:
         super().__init__(scene.model)
-        model = self.model
+        self.scene, self.grid, model = scene, grid, self.model
         self.instances = ("", ROBOT, *scene.entities)
         self._instance_of_body = instances_of_bodies(model, scene)
-        self._grid = grid
         # Only meshes are culled. Other shapes have few triangles, and Mesa's software driver sometimes smears a wall
         # behind the camera into the image: upstream's images have that, so these must too.
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
@@ -193,6 +193,11 @@ class Stage(Viewpoints):
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         return context
+
+    def save_model(self, into: np.ndarray) -> None:
+        """Write the model as MuJoCo's binary file, uint8 [``mujoco.mj_sizeModel(model)``]."""
+        with self._lock:
+            mujoco.mj_saveModel(self.model, None, into)
 
     def new_frame(self) -> mujoco.MjvScene:
         """An empty list of things to draw."""
@@ -258,7 +263,7 @@ class Stage(Viewpoints):
             self._site_groups[site] = 0 if any(is_on(pose.qpos[knob]) for knob in knobs) else HIDDEN
 
     def _shown(self, qpos: np.ndarray) -> np.ndarray:
-        return np.round(qpos / self._grid) * self._grid if self._grid else qpos
+        return np.round(qpos / self.grid) * self.grid if self.grid else qpos
 
     def _see(
         self, frame: mujoco.MjvScene, view: View, aspect: float, choose: Callable[[Sight], np.ndarray] | None
