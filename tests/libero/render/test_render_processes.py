@@ -80,6 +80,7 @@ def test_images_that_are_read_late_are_the_same(stage: Stage, slots: int) -> Non
         for is_late in (True, False)
     )
     try:
+        assert late._threads is not None and late._threads._threads[0].painter._readback is not None
         shots = several(stage, slots)
         cameras = CAMERAS[:2]
         for wanted in (Wanted(), ALL):
@@ -151,6 +152,18 @@ def test_scenes_and_slots_of_any_number(renderer: GlRenderer, stage: Stage) -> N
     finally:
         apart.close()
         both.close()
+
+
+def test_processes_stay_when_the_scenes_change(apart: GlRenderer, renderer: GlRenderer, stage: Stage) -> None:
+    pids, old, expected = apart.pids, apart.stages, rgb(renderer, *several(stage))
+    other = Stage(tiny_scene())
+    for stages in ([other], [other, stage], [stage]):
+        assert apart.use(stages)
+        shots = [Shot(i % len(stages), one.pose, one.options) for i, one in enumerate(several(stage))]
+        np.testing.assert_array_equal(rgb(apart, *shots), expected)
+    assert apart.use(old)
+    assert apart.pids == pids
+    assert not renderer.use([other])
 
 
 def test_what_is_not_there_is_refused_as_with_threads(apart: GlRenderer, stage: Stage) -> None:

@@ -131,13 +131,14 @@ class CameraRig:
         return self._stages
 
     def renderer(self, stages: Sequence[Stage]) -> GlRenderer:
-        """A renderer of these stages, kept until others are requested.
+        """A renderer of these stages, kept until others are requested; one whose processes draw is kept then, too.
 
         Raises:
             GlError: there is no GL.
         """
-        if self._renderer is None or self._renderer.stages != tuple(stages):
+        if self._renderer is not None and self._renderer.stages != tuple(stages) and not self._renderer.use(stages):
             self._drop()
+        if self._renderer is None:
             self._renderer = GlRenderer(
                 stages,
                 height=self.config.height,

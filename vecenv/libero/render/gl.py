@@ -96,11 +96,10 @@ class GlRenderer:
         self._made_in, self._closed = os.getpid(), False
         self._threads: _Threads | None = None
         self._processes: Processes | None = None
-        scenes = dict(enumerate(self.stages))
         if num_processes is not None:
-            self._processes, self._chooses = Processes(scenes, self._look, num_processes), False
+            self._processes, self._chooses = Processes(self.stages, self._look, num_processes), False
         else:
-            self._threads = _Threads(scenes, self._look, num_threads)
+            self._threads = _Threads(dict(enumerate(self.stages)), self._look, num_threads)
             self._chooses = num_threads is None and not self._threads.in_software
         _live.add(self)
         _close_at_exit()
@@ -163,6 +162,15 @@ class GlRenderer:
                 self._threads.draw(job)
         return job.frames()
 
+    def use(self, stages: Sequence[Stage]) -> bool:
+        """Render other scenes from now on; False if that takes a new renderer, because threads draw."""
+        with self._calls:
+            if self._processes is None:
+                return False
+            self._processes.use(stages)
+            self.stages = tuple(stages)
+            return True
+
     def close(self) -> None:
         """Free the contexts, and end the threads and processes. Closing twice is harmless."""
         with self._calls:
@@ -182,7 +190,7 @@ class GlRenderer:
         if self._processes is not None:
             self._processes.grow(min(cores, layout.slots))
         elif layout.slots > 1 and cores > 1:
-            self._processes = Processes(dict(enumerate(self.stages)), self._look, min(cores, layout.slots))
+            self._processes = Processes(self.stages, self._look, min(cores, layout.slots))
             threads, self._threads = self._threads, None
             if threads is not None:
                 threads.close()

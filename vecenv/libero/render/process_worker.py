@@ -67,7 +67,7 @@ class Request:
     """What a process is to draw; handles of ``stages`` follow it, then that of the memory if it is new.
 
     Attributes:
-        stages: those that are new to the process.
+        stages: those that are new to the process. used: the numbers of all that may be drawn later.
         memory: number of the memory that images go to. memories: the numbers that are still in use.
         is_new: whether the process has not got this memory.
         layout: of the memory.
@@ -77,6 +77,7 @@ class Request:
     """
 
     stages: Sequence[SentStage]
+    used: frozenset[int]
     memory: int
     memories: frozenset[int]
     is_new: bool
@@ -113,6 +114,9 @@ class _Server:
             del self._memories[number]
         if request.is_new:
             self._memories[request.memory] = mmap.mmap(handles[-1], os.fstat(handles[-1]).st_size)
+        for number in self._stages.keys() - request.used:
+            self.painter.forget(number)
+            del self._stages[number]
         for sent, handle in zip(request.stages, handles, strict=False):
             self._stages[sent.number] = sent.load(handle)
 

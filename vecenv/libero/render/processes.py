@@ -19,6 +19,7 @@ import sys
 import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from multiprocessing import reduction
 from multiprocessing.connection import Connection
 from typing import Any
@@ -52,7 +53,7 @@ class Processes:
     """Processes that draw, each with one GL context.
 
     Args:
-        stages: the scenes by number.
+        stages: the scenes.
         look: how they draw; its memory for layers is that of all together.
         count: how many; fewer if the driver gives fewer contexts.
 
@@ -60,10 +61,12 @@ class Processes:
         GlError: none can be started, or the driver gives no context.
     """
 
-    def __init__(self, stages: Mapping[int, Stage], look: Look, count: int) -> None:
+    def __init__(self, stages: Sequence[Stage], look: Look, count: int) -> None:
         if not hasattr(os, "memfd_create"):
             raise GlError("rendering processes need Linux; set num_threads in place of num_processes")
-        self._stages, self._look = stages, look
+        self._look, self._stages = look, dict[int, Stage]()
+        self._numbers, self._order = itertools.count(), list[int]()
+        self.use(stages)
         self._count, self._most = 0, sys.maxsize
         self._workers: list[_Worker] = []
         self._memories = _Memories()
@@ -93,6 +96,12 @@ class Processes:
                 self._open(worker)
         self._count = len(self._workers)
 
+    def use(self, stages: Sequence[Stage]) -> None:
+        """Draw these scenes from now on; processes keep those of them that they have, and forget the others."""
+        known = {stage: number for number, stage in self._stages.items()}
+        self._order = [known[stage] if stage in known else next(self._numbers) for stage in stages]
+        self._stages = dict(zip(self._order, stages, strict=True))
+
     def _open(self, worker: _Worker) -> None:
         try:
             worker.opened()
@@ -113,7 +122,8 @@ class Processes:
         if len(self._workers) < self._count:
             self.grow(self._count)
         memory, root = self._memories.take(layout.bytes)
-        job = Job.of(shots, cameras, layout, Arrays.over(root, layout))
+        numbered = {slot: replace(shot, stage=self._order[shot.stage]) for slot, shot in shots.items()}
+        job = Job.of(numbered, cameras, layout, Arrays.over(root, layout))
         shares = {index: tasks for index, tasks in enumerate(job.shares(len(self._workers))) if tasks}
         errors: list[VecenvError] = []
         with self._all_or_none():
@@ -153,6 +163,7 @@ class Processes:
                         models[stage] = files.enter_context(_file_of(self._stages[stage]))
                 request = Request(
                     stages=[_sent(stage, self._stages[stage]) for stage in missing],
+                    used=frozenset(self._stages),
                     memory=memory.number,
                     memories=self._memories.numbers,
                     is_new=memory.number not in worker.memories,
@@ -241,7 +252,7 @@ class _Worker:
                 reduction.send_handle(self._pipe, handle, self.pid)
         except OSError as error:
             raise _Gone(self._how()) from error
-        self.stages |= {sent.number for sent in request.stages}
+        self.stages = (self.stages & request.used) | {sent.number for sent in request.stages}
         self.memories = (self.memories & request.memories) | {request.memory}
 
     def receive(self) -> Any:
