@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -15,6 +16,7 @@ import pytest
 from support.box_scene import SIZE, rgb, shot, tiny_scene
 from support.images import needs_gl
 
+import vecenv
 from vecenv.libero.render import gl, painter, processes
 from vecenv.libero.render.drawing import Stage
 from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
@@ -80,7 +82,8 @@ def test_images_that_are_read_late_are_the_same(stage: Stage, slots: int) -> Non
         for is_late in (True, False)
     )
     try:
-        assert late._threads is not None and late._threads._threads[0].painter._readback is not None
+        assert late._threads is not None
+        assert late._threads._threads[0].painter._readback is not None
         shots = several(stage, slots)
         cameras = CAMERAS[:2]
         for wanted in (Wanted(), ALL):
@@ -327,3 +330,35 @@ def test_no_process_outlives_its_caller(how: str, status: int) -> None:
     assert ["it does not survive a fork" in line for line in said] == [True] * (how == "fork")
     psutil.wait_procs([psutil.Process(int(pid))] if psutil.pid_exists(int(pid)) else [], timeout=20)
     assert not psutil.pid_exists(int(pid))
+
+
+@pytest.mark.heavy
+def test_environments_at_once_draw_what_threads_draw() -> None:
+    """Two with processes beside one with threads, in motion, and after their scenes have changed."""
+    render: dict[str, object] = {"height": 128, "width": 128, "cameras": [ABOVE]}
+    options = ({"num_threads": 2}, {"num_processes": 2}, {"num_processes": 1})
+    with contextlib.ExitStack() as opened:
+        envs = [
+            opened.enter_context(
+                vecenv.make("libero_object", tasks=[0, 1], episodes=[0], num_threads=1, render={**render, **own})
+            )
+            for own in options
+        ]
+        rng = np.random.default_rng(0)
+        for tasks in ([0, 1], [1, 2]):
+            for env in envs:
+                env.set_episodes(tasks=tasks, episodes=[3])
+                env.set_visuals(LOOKS[:2])
+                env.reset()
+            for _ in range(3):
+                actions = rng.uniform(-1, 1, (2, 7))
+                seen = []
+                for env in envs:
+                    env.step_continuous(actions)
+                    now = env.observe_egocentric()
+                    images = [now.images[name] for name in ("agentview", "wrist", "above")]
+                    seen.append([*images, now.depths["wrist"], now.segmentations["agentview"]])
+                for expected, *others in zip(*seen, strict=True):
+                    assert expected.any()
+                    for found in others:
+                        np.testing.assert_array_equal(found, expected)

@@ -23,8 +23,9 @@ import numpy as np
 
 from vecenv.libero.physics.base import Group
 from vecenv.libero.render import lod
-from vecenv.libero.render.drawing import ROBOT, Pose, Stage, Viewpoints, camera_view
+from vecenv.libero.render.drawing import ROBOT, Pose, Stage, Viewpoints
 from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
+from vecenv.libero.render.jobs import camera_view
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.render.sources import InstalledVisuals, VisualSource
 from vecenv.libero.scene.bddl import Problem

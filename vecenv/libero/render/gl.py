@@ -54,6 +54,8 @@ __all__ = [
     "open_context",
 ]
 
+_COLORS = Wanted()
+
 
 class GlRenderer:
     """Renders batches; safe to use from several threads, one call at a time each.
@@ -63,8 +65,8 @@ class GlRenderer:
         height, width: of the images, pixels.
         num_threads: threads of this process that draw. If the driver gives fewer contexts, fewer draw.
         num_processes: processes that draw in place of threads, fewer if the driver gives fewer contexts. With neither
-            number, threads draw where the driver draws in software, one per core; where it draws in hardware, processes,
-            one per slot and at most one per core, or for a single slot threads.
+            number, threads draw where the driver draws in software, one per core; where it draws in hardware,
+            processes, one per slot and at most one per core, or for a single slot threads.
         gl: ``"egl"``, ``"osmesa"`` or None (``choose``).
         layer_memory: for stored images of what stands still (``vecenv.libero.render.composite``), bytes; with 0 every
             image is drawn whole.
@@ -123,7 +125,7 @@ class GlRenderer:
         self,
         shots: Sequence[Shot],
         cameras: Sequence[str | UserCamera],
-        wanted: Wanted = Wanted(),
+        wanted: Wanted = _COLORS,
         out: Mapping[str, np.ndarray] | None = None,
     ) -> Frames:
         """Render every slot through every camera.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vecenv.libero.render.culling import View
-from vecenv.libero.render.drawing import Pose, Stage, camera_view
+from vecenv.libero.render.drawing import Pose, Stage
 from vecenv.libero.render.options import RenderError, UserCamera, VisualOptions
 from vecenv.observations import CameraView
 
@@ -85,7 +85,7 @@ class Arrays(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """What decides the arrays of a job: the names of its cameras, the images wanted of them, their numbers and sizes."""
+    """What decides the arrays of a job: the names of its cameras, the images wanted, the number of slots, and sizes."""
 
     names: tuple[str, ...]
     wanted: Wanted
@@ -130,9 +130,7 @@ class Job:
     views: dict[str, list[View | None]]
 
     @classmethod
-    def of(
-        cls, shots: Mapping[int, Shot], cameras: Sequence[str | UserCamera], layout: Layout, arrays: Arrays
-    ) -> Job:
+    def of(cls, shots: Mapping[int, Shot], cameras: Sequence[str | UserCamera], layout: Layout, arrays: Arrays) -> Job:
         """A job of which nothing is drawn."""
         return cls(shots, cameras, layout.wanted, arrays, {name: [None] * layout.slots for name in layout.names})
 
@@ -185,6 +183,18 @@ def check_request(
     for name, array in out.items():
         if array.shape != size or array.dtype != np.uint8:
             raise RenderError(f"out[{name!r}] is {array.dtype} {array.shape}; expected uint8 {size}")
+
+
+def camera_view(views: Sequence[View], height: int, width: int) -> CameraView:
+    """The contract's ``CameraView`` of a camera, from the views of B slots."""
+    focal = np.array([height / 2 / np.tan(np.deg2rad(view.fovy) / 2) for view in views])
+    matrices = np.zeros((len(views), 3, 3))
+    # Delivered images are mirrored: x grows to the camera's left.
+    matrices[:, 0, 0], matrices[:, 1, 1], matrices[:, 2, 2] = -focal, focal, 1.0
+    matrices[:, 0, 2], matrices[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
+    # MuJoCo's camera axes are right, up, back; the contract's right, down, forward.
+    rotations = np.stack([view.mat for view in views]) * np.array([1.0, -1.0, -1.0])
+    return CameraView(intrinsics=matrices, pos=np.stack([view.pos for view in views]), mat=rotations)
 
 
 def camera_name(camera: str | UserCamera) -> str:

@@ -205,9 +205,9 @@ class RenderConfig:
         antialias: of ray-traced images: trace edges again with four rays a pixel. Images are 1 to 4 dB closer to GL's
             and take about twice as long. GL always takes four samples.
         num_threads: threads that render with GL, each with a context of its own.
-        num_processes: processes that do so in place of threads; only one of the two may be given. With neither, threads
-            render where the GL driver draws in software, one per core; and where it draws in hardware processes, one per
-            slot and at most one per core (a single slot is rendered by threads).
+        num_processes: processes that do so in place of threads; only one of the two may be given. With neither,
+            threads render where the GL driver draws in software, one per core; where it draws in hardware, processes,
+            one per slot and at most one per core (a single slot is rendered by threads).
         colors: ``"published"``, textures as MuJoCo up to 3.3.2 shows them, under which LIBERO's demonstrations were
             rendered and its checkpoints scored; or ``"current"``, as the installed MuJoCo shows them
             (``vecenv.libero.render.colors`` says what differs).

@@ -1,7 +1,7 @@
 """One GL context that draws tasks: scenes are uploaded when they are first drawn.
 
-In: jobs and their tasks (``vecenv.libero.render.jobs``). Out: the images, in the arrays of the job. MuJoCo's own renderer
-draws, so ``lod="exact"`` is upstream's image. A painter belongs to one thread, of this process
+In: jobs and their tasks (``vecenv.libero.render.jobs``). Out: the images, in the arrays of the job. MuJoCo's own
+renderer draws, so ``lod="exact"`` is upstream's image. A painter belongs to one thread, of this process
 (``vecenv.libero.render.gl``) or of a rendering process (``vecenv.libero.render.process_worker``).
 """
 

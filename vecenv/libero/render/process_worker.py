@@ -1,7 +1,7 @@
 """A rendering process: it draws what ``vecenv.libero.render.processes`` sends, into memory shared with the sender.
 
-In: requests over a socket, with handles of scenes and of memory. Out: images in that memory, and where the cameras were.
-It is started as a module, so the caller's script is not imported again, and ends when the caller does.
+In: requests over a socket, with handles of scenes and of memory. Out: images in that memory, and where the cameras
+were. It is started as a module, so the caller's script is not imported again, and ends when the caller does.
 """
 
 from __future__ import annotations

@@ -282,7 +282,7 @@ class _Worker:
         return f"rendering process {self.pid} was ended by {name}{hint}"
 
     def leave(self, *, at_once: bool = False) -> None:
-        """Close this end of the socket, upon which the process ends, unless a fork of the one that started it does so."""
+        """Close this end of the socket; the process ends once no fork of its caller has that end open."""
         self._pipe.close()
         if at_once:
             self._process.kill()
