@@ -29,7 +29,7 @@ class GlError(SimulationError):
     """No GL is available, or it failed; the message says what would help."""
 
 
-class ContextLost(Exception):
+class ContextLost(SimulationError):
     """GL reported an error: what was uploaded may be lost."""
 
 

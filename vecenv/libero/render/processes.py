@@ -45,7 +45,7 @@ _SPARE = 4
 _PATIENCE = 10.0
 
 
-class _Gone(Exception):
+class _Gone(GlError):
     """A process has ended; the message says how."""
 
 
