@@ -1,12 +1,13 @@
 """Physics and two 256 x 256 images every control step: vecenv against upstream's SubprocVectorEnv on the same machine.
 
 Upstream runs one process for each of its environments, each an ``OffScreenRenderEnv``: as many as there are cores, or,
-with ``--processes slots``, as many as vecenv has slots. vecenv runs one process with as many threads as there are
-cores, once with upstream's image (``lod="exact"``) and once with simplified meshes (``"fast"``); with ``--physics``
-also without images, against upstream's environments without a renderer. All draw with the same GL (``MUJOCO_GL``:
-software on a CPU, the GPU's with ``egl`` where there is one) and take the same random actions. The sides take turns
-within one run, a few control steps each, so other load on the machine affects all of them; rates are environment
-control steps a second, medians over the turns, and ratios are medians of the turns' ratios. ``psnr`` and ``ssim``
+with ``--processes slots``, as many as vecenv has slots. vecenv steps in one process with as many threads as there are
+cores and draws as ``RenderConfig`` does by default (threads, or processes where GL draws in hardware), once with
+upstream's image (``lod="exact"``) and once with simplified meshes (``"fast"``); with ``--physics`` also without
+images, against upstream's environments without a renderer. All draw with the same GL (``MUJOCO_GL``: software on a
+CPU, the GPU's with ``egl`` where there is one) and take the same random actions. The sides take turns within one run,
+a few control steps each, so other load on the machine affects all of them; rates are environment control steps a
+second, medians over the turns, and ratios are medians of the turns' ratios. ``psnr`` and ``ssim``
 compare ``"fast"`` with ``"exact"``, the worst image of the run.
 
     python benchmarks/render.py

@@ -15,7 +15,6 @@ from vecenv.errors import VecenvError
 
 # Exceptions that do not derive from VecenvError, with the reason.
 EXCEPTIONS = {
-    "_ContextLost": "raised and caught in vecenv.libero.render.gl, which then makes a new GL context",
     "_Stopped": "raised and caught in vecenv_eval.engines.ray_actor, where it ends the episode loop",
     "RunStopped": "raised in vecenv_eval.panel.session and caught in vecenv_eval.loop, as Ctrl-C is",
     "Terminated": "SIGTERM, which vecenv_eval.cli raises and catches as Python does with KeyboardInterrupt",

@@ -15,12 +15,12 @@ from support.images import needs_gl
 
 import vecenv
 from vecenv.libero.env import LiberoEnv
-from vecenv.libero.render import gl, lod
+from vecenv.libero.render import lod, painter
 from vecenv.libero.render.colors import visual_scene
 from vecenv.libero.render.composite import Compositor
 from vecenv.libero.render.culling import View
 from vecenv.libero.render.drawing import Pose, Sight, Stage
-from vecenv.libero.render.gl import GlRenderer, Shot
+from vecenv.libero.render.gl import GlRenderer, Shot, Wanted
 from vecenv.libero.render.options import POLICY_CAMERAS, CameraShift, UserCamera, VisualOptions
 from vecenv.libero.render.stillness import SETTLED, Stillness
 from vecenv.libero.tasks.suites import list_tasks
@@ -120,7 +120,7 @@ class Drawn:
 
 @contextmanager
 def drawn(monkeypatch: pytest.MonkeyPatch, *stages: Stage, size: int = SIZE) -> Iterator[Drawn]:
-    monkeypatch.setattr(gl, "is_worthwhile", lambda: True)
+    monkeypatch.setattr(painter, "is_worthwhile", lambda: True)
     found, copy = Drawn(stages, size), Compositor.copy
 
     def counted(self: Compositor, layer: int, area: mujoco.MjrRect) -> None:
@@ -200,7 +200,7 @@ def test_depths_and_segmentations_between_images_change_nothing(monkeypatch: pyt
         for tick in range(4):
             one = posed(stage, (0.1 * tick, 0), (0, 0))
             both.compare(one)
-            both.layered.render([one], EYES, gl.Wanted(rgb=True, depth=True, segmentation=True))
+            both.layered.render([one], EYES, Wanted(rgb=True, depth=True, segmentation=True))
         assert both.copies
 
 

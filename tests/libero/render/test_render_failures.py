@@ -14,7 +14,7 @@ import pytest
 from support.box_scene import SIZE, rgb, shot
 from support.images import needs_gl
 
-from vecenv.libero.render import gl
+from vecenv.libero.render import contexts, painter
 from vecenv.libero.render.drawing import Stage
 from vecenv.libero.render.gl import GlError, GlRenderer, available, choose
 
@@ -23,7 +23,7 @@ pytestmark = needs_gl
 
 def test_without_gl_libraries_the_error_names_the_packages(monkeypatch: pytest.MonkeyPatch, stage: Stage) -> None:
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(gl, "_loads", lambda library: False)
+    monkeypatch.setattr(contexts, "_loads", lambda library: False)
     with pytest.raises(GlError, match=r"libegl1.*libosmesa6.*Physics does not need it"):
         GlRenderer([stage])
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
@@ -46,7 +46,7 @@ def test_a_driver_that_refuses_is_named(monkeypatch: pytest.MonkeyPatch, stage: 
 
 
 def test_fewer_contexts_than_threads_are_enough(monkeypatch: pytest.MonkeyPatch, stage: Stage) -> None:
-    opened, real = [], gl.open_context
+    opened, real = [], painter.open_context
 
     def scarce(*arguments: Any) -> Any:
         if len(opened) == 2:
@@ -54,7 +54,7 @@ def test_fewer_contexts_than_threads_are_enough(monkeypatch: pytest.MonkeyPatch,
         opened.append(arguments)
         return real(*arguments)
 
-    monkeypatch.setattr(gl, "open_context", scarce)
+    monkeypatch.setattr(painter, "open_context", scarce)
     renderer = GlRenderer([stage], height=SIZE, width=SIZE, num_threads=5)
     try:
         assert renderer.num_threads == 2

@@ -10,7 +10,7 @@ from support.images import needs_gl
 
 import vecenv
 from vecenv.libero.env import LiberoEnv
-from vecenv.libero.render import gl
+from vecenv.libero.render import contexts, gl
 from vecenv.libero.render.gl import GlError
 from vecenv.libero.render.options import CameraShift, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.observations import Egocentric, ImagesUnavailable
@@ -166,7 +166,7 @@ def test_a_camera_of_a_taken_name_is_refused() -> None:
 
 def test_physics_needs_no_gl(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(gl, "_loads", lambda library: False)
+    monkeypatch.setattr(contexts, "_loads", lambda library: False)
     env = vecenv.make("libero_object", task=0, episodes=[0])
     try:
         env.reset()

@@ -23,8 +23,9 @@ import numpy as np
 
 from vecenv.libero.physics.base import Group
 from vecenv.libero.render import lod
-from vecenv.libero.render.drawing import ROBOT, Pose, Stage, Viewpoints, camera_view
+from vecenv.libero.render.drawing import ROBOT, Pose, Stage, Viewpoints
 from vecenv.libero.render.gl import Frames, GlError, GlRenderer, Shot, Wanted
+from vecenv.libero.render.jobs import camera_view
 from vecenv.libero.render.options import ALIASES, RenderConfig, RenderError, UserCamera, VisualOptions
 from vecenv.libero.render.sources import InstalledVisuals, VisualSource
 from vecenv.libero.scene.bddl import Problem
@@ -131,18 +132,20 @@ class CameraRig:
         return self._stages
 
     def renderer(self, stages: Sequence[Stage]) -> GlRenderer:
-        """A renderer of these stages, kept until others are requested.
+        """A renderer of these stages, kept until others are requested; one whose processes draw is kept then, too.
 
         Raises:
             GlError: there is no GL.
         """
-        if self._renderer is None or self._renderer.stages != tuple(stages):
+        if self._renderer is not None and self._renderer.stages != tuple(stages) and not self._renderer.use(stages):
             self._drop()
+        if self._renderer is None:
             self._renderer = GlRenderer(
                 stages,
                 height=self.config.height,
                 width=self.config.width,
                 num_threads=self.config.num_threads,
+                num_processes=self.config.num_processes,
                 gl=self.config.gl,
             )
         return self._renderer

@@ -29,8 +29,6 @@ from vecenv.libero.render.stillness import Plan, Stillness
 
 # Memory for the layers of all threads of a renderer, bytes.
 LAYER_MEMORY = 256 << 20
-# The drivers for which drawing less saves more than it costs; GPUs draw a scene faster than Python lists what moved.
-_SOFTWARE = ("llvmpipe", "softpipe", "swrast")
 # Slots have other options each, at most so many sets of looks are kept.
 _KEPT_OPTIONS = 256
 
@@ -45,10 +43,13 @@ _ITEMS = (mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_SITE)
 
 
 def is_worthwhile() -> bool:
-    """Whether the driver of this thread's context draws on the CPU and has all commands."""
+    """Whether the driver of this thread's context draws on the CPU and has all commands.
+
+    GPUs draw a scene faster than Python lists what has moved.
+    """
     try:
         commands.commands()
-        return commands.renderer_name().startswith(_SOFTWARE)
+        return commands.draws_in_software()
     except AttributeError:
         return False
 

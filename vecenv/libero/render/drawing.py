@@ -20,12 +20,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from vecenv.libero.render.burners import burners
 from vecenv.libero.render.colors import SKIN
 from vecenv.libero.render.culling import DRAWN_GROUPS, HIDDEN, Boxes, Cone, Mirrors, View, Walls
 from vecenv.libero.render.options import ALIASES, RenderError, UserCamera, VisualOptions
-from vecenv.libero.scene import catalog
-from vecenv.libero.scene.scene import Entity, Scene
-from vecenv.observations import CameraView
+from vecenv.libero.scene.scene import Scene
 
 # Upstream does not draw sites of these names.
 TOOL_SITES = ("robot0_", "gripper0_")
@@ -48,18 +47,6 @@ class Pose:
     qpos: np.ndarray
     body_pos: np.ndarray
     body_quat: np.ndarray
-
-
-def camera_view(views: Sequence[View], height: int, width: int) -> CameraView:
-    """The contract's ``CameraView`` of a camera, from the views of B slots."""
-    focal = np.array([height / 2 / np.tan(np.deg2rad(view.fovy) / 2) for view in views])
-    matrices = np.zeros((len(views), 3, 3))
-    # Delivered images are mirrored: x grows to the camera's left.
-    matrices[:, 0, 0], matrices[:, 1, 1], matrices[:, 2, 2] = -focal, focal, 1.0
-    matrices[:, 0, 2], matrices[:, 1, 2] = (width - 1) / 2, (height - 1) / 2
-    # MuJoCo's camera axes are right, up, back; the contract's right, down, forward.
-    rotations = np.stack([view.mat for view in views]) * np.array([1.0, -1.0, -1.0])
-    return CameraView(intrinsics=matrices, pos=np.stack([view.pos for view in views]), mat=rotations)
 
 
 @dataclass(frozen=True)
@@ -145,6 +132,7 @@ class Stage(Viewpoints):
 
     Attributes:
         model: the visual model.
+        scene, grid: as given.
         instances: the names that segmentation images index; "" (index 0) is everything else: table, floor, walls.
         boxes: the bounding boxes of its items.
         has_shadows: whether a light casts shadows.
@@ -152,15 +140,14 @@ class Stage(Viewpoints):
 
     def __init__(self, scene: Scene, grid: float = 0.0) -> None:
         super().__init__(scene.model)
-        model = self.model
+        self.scene, self.grid, model = scene, grid, self.model
         self.instances = ("", ROBOT, *scene.entities)
         self._instance_of_body = instances_of_bodies(model, scene)
-        self._grid = grid
         # Only meshes are culled. Other shapes have few triangles, and Mesa's software driver sometimes smears a wall
         # behind the camera into the image: upstream's images have that, so these must too.
         self._always = model.geom_type != mujoco.mjtGeom.mjGEOM_MESH
         self.boxes, self._walls, self._mirrors = Boxes(model), Walls(model), Mirrors(model)
-        self._burners = _burners(model, scene)
+        self._burners = burners(model, scene)
         self._skins = np.array([model.geom(geom).name.startswith(SKIN) for geom in range(model.ngeom)], bool)
         for site in range(model.nsite):
             if model.site(site).name.startswith(TOOL_SITES):
@@ -193,6 +180,11 @@ class Stage(Viewpoints):
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         return context
+
+    def save_model(self, into: np.ndarray) -> None:
+        """Write the model as MuJoCo's binary file, uint8 [``mujoco.mj_sizeModel(model)``]."""
+        with self._lock:
+            mujoco.mj_saveModel(self.model, None, into)
 
     def new_frame(self) -> mujoco.MjvScene:
         """An empty list of things to draw."""
@@ -258,7 +250,7 @@ class Stage(Viewpoints):
             self._site_groups[site] = 0 if any(is_on(pose.qpos[knob]) for knob in knobs) else HIDDEN
 
     def _shown(self, qpos: np.ndarray) -> np.ndarray:
-        return np.round(qpos / self._grid) * self._grid if self._grid else qpos
+        return np.round(qpos / self.grid) * self.grid if self.grid else qpos
 
     def _see(
         self, frame: mujoco.MjvScene, view: View, aspect: float, choose: Callable[[Sight], np.ndarray] | None
@@ -370,28 +362,6 @@ def instances_of_bodies(model: mujoco.MjModel, scene: Scene) -> np.ndarray:
         own = 1 if name.startswith(_ROBOT_BODIES) else roots.get(name, 0)
         found[body] = own or found[model.body_parentid[body]]
     return found
-
-
-def _burners(model: mujoco.MjModel, scene: Scene) -> list[tuple[int, list[int], Callable[[float], bool]]]:
-    """Sites that glow while their stove is on: site, addresses of its knobs in qpos, and the test for being on."""
-    found = []
-    for entity in scene.entities.values():
-        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, f"{entity.name}_burner")
-        turn_on = catalog.articulation(entity.category).turn_on
-        if site >= 0 and turn_on is not None:
-            found.append((site, hinges(model, entity), _passes(turn_on)))
-    return found
-
-
-def hinges(model: mujoco.MjModel, entity: Entity) -> list[int]:
-    """Addresses in qpos of the hinges of an entity."""
-    joints = [model.joint(name) for name in entity.joints]
-    return [int(joint.qposadr[0]) for joint in joints if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE]
-
-
-def _passes(test: catalog.JointTest) -> Callable[[float], bool]:
-    sign, bound, inclusive = test.sign_form()
-    return lambda qpos: sign * qpos >= bound if inclusive else sign * qpos > bound
 
 
 def _alpha(model: mujoco.MjModel, rgba: np.ndarray, material: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vecenv.libero.render import culling, drawing, surfaces
+from vecenv.libero.render.burners import hinges
 from vecenv.libero.render.surfaces import RGB_ROLE, Corners, Look
 from vecenv.libero.scene import catalog
 from vecenv.libero.scene.scene import Scene
@@ -296,7 +297,7 @@ def _burners(model: mujoco.MjModel, scene: Scene) -> dict[int, tuple[list[int], 
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, f"{entity.name}_burner")
         turn_on = catalog.articulation(entity.category).turn_on
         if site >= 0 and turn_on is not None:
-            found[site] = drawing.hinges(model, entity), turn_on.sign_form()
+            found[site] = hinges(model, entity), turn_on.sign_form()
     return found
 
 

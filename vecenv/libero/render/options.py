@@ -204,7 +204,10 @@ class RenderConfig:
             GPUs; its images differ a little, and of visual options it swaps no textures and colours no materials.
         antialias: of ray-traced images: trace edges again with four rays a pixel. Images are 1 to 4 dB closer to GL's
             and take about twice as long. GL always takes four samples.
-        num_threads: rendering threads, each with a GL context; None for one per core.
+        num_threads: threads that render with GL, each with a context of its own.
+        num_processes: processes that do so in place of threads; only one of the two may be given. With neither,
+            threads render where the GL driver draws in software, one per core; where it draws in hardware, processes,
+            one per slot and at most one per core (a single slot is rendered by threads).
         colors: ``"published"``, textures as MuJoCo up to 3.3.2 shows them, under which LIBERO's demonstrations were
             rendered and its checkpoints scored; or ``"current"``, as the installed MuJoCo shows them
             (``vecenv.libero.render.colors`` says what differs).
@@ -218,10 +221,12 @@ class RenderConfig:
     engine: str = "gl"
     antialias: bool = False
     num_threads: int | None = None
+    num_processes: int | None = None
     colors: str = "published"
 
     def __post_init__(self) -> None:
-        configs.check(self, RenderError, ranges={"num_threads": (1, 4096)})
+        configs.check(self, RenderError, ranges={"num_threads": (1, 4096), "num_processes": (1, 4096)})
+        check_numbers(self.num_threads, self.num_processes)
         if not (1 <= self.height <= LARGEST_SIDE and 1 <= self.width <= LARGEST_SIDE):
             raise RenderError(f"images of {self.height} x {self.width} pixels: each side must be 1 to {LARGEST_SIDE}")
         if self.lod not in LODS:
@@ -232,6 +237,18 @@ class RenderConfig:
         names = [camera.name for camera in self.cameras]
         if len(set(names)) != len(names):
             raise RenderError(f"two cameras have the same name: {', '.join(names)}")
+
+
+def check_numbers(num_threads: int | None, num_processes: int | None) -> None:
+    """Check that threads or processes render.
+
+    Raises:
+        RenderError: both numbers are given.
+    """
+    if num_threads is not None and num_processes is not None:
+        raise RenderError(
+            f"num_threads={num_threads}, num_processes={num_processes}: threads or processes render, give one of them"
+        )
 
 
 def check_colors(colors: str) -> None:
