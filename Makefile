@@ -12,13 +12,17 @@ EVAL_ARGS ?= --suite libero_object --policy pick_place --episodes 5
 WORKERS ?= 2
 # `make system`: install, or dry to only print the commands.
 SYSTEM ?= install
+# More arguments: --strict or --report-only of `make audit`, --pythons 3.12 of `make dist`, --upgrade of `make lock`.
+AUDIT_ARGS ?=
+DIST_ARGS ?=
+LOCK_ARGS ?=
 # More arguments for pytest, for example TEST_ARGS="tests/test_cli.py -k doctor".
 TEST_ARGS ?=
 
 RUN := $(VENV)/bin
 PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help setup system eval test test-heavy upstream parity bench settled lint format doctor dist-check clean distclean
+.PHONY: help setup system eval test test-heavy upstream parity bench settled lint format audit doctor dist dist-check lock clean distclean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -81,8 +85,20 @@ format: $(VENV)/.installed-dev ## Format the code and apply ruff's automatic fix
 doctor: $(VENV)/.installed-eval ## Show what is installed on this machine and what is missing
 	@$(RUN)/vecenv doctor
 
-dist-check: $(VENV)/.installed-dev ## Build the wheel, install it in a temporary venv and test it there
-	@scripts/dist_check.sh $(RUN)/python
+audit: $(VENV)/.installed-dev ## Check security: bandit over the code, pip-audit over the installed packages
+	@$(RUN)/python scripts/audit.py $(AUDIT_ARGS)
+
+dist: $(VENV)/.installed-dev ## Build wheel and sdist in dist/, check what is in them, try the wheel on each supported Python
+	@$(RUN)/python scripts/dist.py $(DIST_ARGS)
+
+dist-check: $(VENV)/.installed-dev ## The same in a temporary folder, tried on the Python of .venv alone
+	@out=$$(mktemp -d) && trap 'rm -rf "$$out"' EXIT && $(RUN)/python scripts/dist.py --out "$$out" \
+		--pythons "$$($(RUN)/python -c 'import sys; print("%d.%d" % sys.version_info[:2])')"
+
+lock: ## Write requirements-dev.lock: exact versions and hashes of what `make setup` may install (needs uv)
+	@command -v uv >/dev/null || { echo "error: make lock needs uv: pip install uv, or see its documentation" >&2; exit 1; }
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes --quiet \
+		--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" $(LOCK_ARGS) --output-file requirements-dev.lock
 
 clean: ## Remove caches and build outputs; .venv and results/ stay
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis *.egg-info

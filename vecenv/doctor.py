@@ -244,7 +244,7 @@ def run_python(source: str, **environment: str) -> tuple[bool, str]:
         Whether it exited with 0, and its last line of output or of error.
     """
     try:
-        done = subprocess.run(
+        done = subprocess.run(  # nosec B603 # probes of this file, in this Python
             [sys.executable, "-c", source],
             env={**os.environ, **environment},
             capture_output=True,
@@ -384,10 +384,16 @@ def _vulkan_check(run_probe: Callable[..., tuple[bool, str]]) -> Check:
     return Check("Vulkan", ok, False, "; ".join(devices), "" if ok else _MESA_FIX)
 
 
-def _sapien_checks(run_probe: Callable[..., tuple[bool, str]]) -> list[Check]:
-    """Whether SAPIEN, if installed, finds a device to render with; its physics needs none."""
+def _sapien_checks(
+    run_probe: Callable[..., tuple[bool, str]], python: tuple[int, ...] = sys.version_info[:2]
+) -> list[Check]:
+    """Whether SAPIEN, if installed, finds a device to render with; its physics needs none.
+
+    Where it has no wheels, the extra leaves it out, and no row of packages would say that SIMPLER does not run.
+    """
     if not installed_version("sapien"):
-        return []
+        missing = f"none for Python {'.'.join(map(str, python))}"
+        return [Check("SAPIEN wheels", False, False, missing, "Python 3.11 or 3.12")] if python > (3, 12) else []
     ok, text = run_probe(_SAPIEN_PROBE)
     fix = "" if ok else "a Vulkan driver, see the row above; SIMPLER works without images"
     return [Check("SAPIEN images", ok, False, text.splitlines()[-1] if text else "", fix)]

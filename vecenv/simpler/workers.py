@@ -287,7 +287,7 @@ class _Worker:
     def __init__(self, sizes: Sizes, memory: int, environment: dict[str, str]) -> None:
         mine, theirs = socket.socketpair()
         with theirs:
-            self._process = subprocess.Popen(
+            self._process = subprocess.Popen(  # nosec B603 # this module again, in this Python
                 [sys.executable, "-m", "vecenv.simpler.workers", str(theirs.fileno()), str(memory)],
                 pass_fds=(theirs.fileno(), memory),
                 env=environment,

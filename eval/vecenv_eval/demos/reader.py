@@ -112,7 +112,7 @@ class Reader:
                 "HDF5_PLUGIN_PRELOAD": "::",  # no filter is loaded because a file names it
                 **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
             }
-            self._process = subprocess.Popen(
+            self._process = subprocess.Popen(  # nosec B603 # a module of vecenv, in this Python
                 [sys.executable, "-P", "-m", "vecenv_eval.demos.child"],
                 env=environment,
                 stdin=subprocess.PIPE,

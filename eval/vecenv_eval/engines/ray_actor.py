@@ -7,7 +7,7 @@ files, so it may be on a machine that does not share the folder.
 
 from __future__ import annotations
 
-import pickle
+import pickle  # nosec B403 # see its use
 import queue
 import socket
 import sys
@@ -214,7 +214,7 @@ class EpisodeActor:
         self._close()
         self._policy, self._loop, self._steps = None, None, 0
         sys.path += [folder for folder in self._path if folder not in sys.path]
-        self._given: Assignment = pickle.loads(self._pickled)
+        self._given: Assignment = pickle.loads(self._pickled)  # nosec B301 # from the run that made this actor
         given = self._given
         policy = make_policy(given.config.policy_name, given.config.policy_args, seed=given.policy_seed)
         self._policy = policy

@@ -5,7 +5,7 @@ A job that was preempted, timed out or killed is repeated as it is, and continue
 
 from __future__ import annotations
 
-import pickle
+import pickle  # nosec B403 # see its use
 import sys
 import traceback
 from collections.abc import Sequence
@@ -59,7 +59,7 @@ class ShardJob:
     def __call__(self) -> ShardOutcome:
         """Run what the shard's folder does not have yet."""
         sys.path += [folder for folder in self._path if folder not in sys.path]
-        config, folder, simulator = pickle.loads(self._pickled)
+        config, folder, simulator = pickle.loads(self._pickled)  # nosec B301 # __init__ pickled it
         try:
             evaluation = Evaluation(config, simulator)
             folder.parent.mkdir(parents=True, exist_ok=True)

@@ -94,7 +94,7 @@ def page(run: Run, other: Run | None = None, *, out: Path, embed_mb: float = EMB
         final="final" in {suite.settings("conditions").get("success") for suite in run.suites},
         comparison=None if other is None else compare(run, other),
         figures=_figures(run, other),
-        plotly_js=Markup(get_plotlyjs()),
+        plotly_js=Markup(get_plotlyjs()),  # nosec B704 # a file of the plotly package
     )
 
 

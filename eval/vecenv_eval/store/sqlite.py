@@ -59,7 +59,7 @@ _NAMES = ", ".join(COLUMNS)
 _CREATE = f"CREATE TABLE episodes ({', '.join(map(' '.join, COLUMNS.items()))}, PRIMARY KEY ({', '.join(KEY)}))"
 # As Record.replaces: the latest record counts, but no error replaces a verdict.
 _INSERT = (
-    f"INSERT INTO episodes ({_NAMES}) VALUES ({', '.join(f':{name}' for name in COLUMNS)}) "
+    f"INSERT INTO episodes ({_NAMES}) VALUES ({', '.join(f':{name}' for name in COLUMNS)}) "  # nosec B608 # own names
     f"ON CONFLICT ({', '.join(KEY)}) "
     f"DO UPDATE SET {', '.join(f'{name} = excluded.{name}' for name in COLUMNS if name not in KEY)} "
     "WHERE excluded.error = '' OR episodes.error <> ''"
@@ -120,7 +120,8 @@ class SqliteRows:
         with self._errors("read"), closing(self._reader()) as connection:
             if not self._has_table(connection):
                 return {}
-            found = connection.execute(f"SELECT {_NAMES} FROM episodes ORDER BY rowid").fetchall()
+            query = f"SELECT {_NAMES} FROM episodes ORDER BY rowid"  # nosec B608 # names of COLUMNS
+            found = connection.execute(query).fetchall()
         records = [self._record(dict(zip(COLUMNS, values, strict=True))) for values in found]
         return {record.key: record for record in records}
 
