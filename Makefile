@@ -18,7 +18,7 @@ TEST_ARGS ?=
 RUN := $(VENV)/bin
 PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help setup system eval test test-heavy upstream parity bench settled lint format doctor dist-check clean distclean
+.PHONY: help setup system eval test test-heavy upstream parity bench settled lint format docs doctor dist-check clean distclean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -78,6 +78,10 @@ format: $(VENV)/.installed-dev ## Format the code and apply ruff's automatic fix
 	@$(RUN)/ruff check --fix-only
 	@$(RUN)/ruff format
 
+docs: $(VENV)/.installed-docs ## Build the documentation into ./site, strictly: a broken link or anchor is an error
+	@NO_MKDOCS_2_WARNING=1 $(RUN)/mkdocs build --strict --quiet
+	@echo "==> site/index.html"
+
 doctor: $(VENV)/.installed-eval ## Show what is installed on this machine and what is missing
 	@$(RUN)/vecenv doctor
 
@@ -85,7 +89,7 @@ dist-check: $(VENV)/.installed-dev ## Build the wheel, install it in a temporary
 	@scripts/dist_check.sh $(RUN)/python
 
 clean: ## Remove caches and build outputs; .venv and results/ stay
-	rm -rf build dist .pytest_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf build dist site .pytest_cache .ruff_cache .hypothesis *.egg-info
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 distclean: clean ## Remove .venv as well
