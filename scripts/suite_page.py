@@ -80,7 +80,7 @@ def _varied() -> Iterator[str]:
         instructions = vecenv.eval_metadata(suite)["instructions"]
         assert isinstance(instructions, tuple)
         yield f"\n### {suite}\n"
-        yield from (f"{index}. {said}" for index, said in enumerate(instructions))
+        yield from (f"- {index}: {said}" for index, said in enumerate(instructions))
 
 
 def main() -> None:
