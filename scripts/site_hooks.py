@@ -42,7 +42,9 @@ def on_files(files: Files, config: Any) -> Files:
     """Add the pages from outside docs/."""
     for name in OUTSIDE:
         files.append(
-            File.generated(config, RENAMED.get(name, name), content=repository_links((ROOT / name).read_text(), name, ""))
+            File.generated(
+                config, RENAMED.get(name, name), content=repository_links((ROOT / name).read_text(), name, "")
+            )
         )
     return files
 
@@ -55,7 +57,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_post_build(config: Any) -> None:
-    """Let the theme's script ask no other host: it does so for diagrams and for old browsers, and pages have neither."""
+    """Let the theme's script ask no other host: it does so for diagrams, which no page has, and for old browsers."""
     for path in Path(config["site_dir"]).glob("assets/javascripts/*.js"):
         text = path.read_text()
         path.write_text(re.sub(r"https://unpkg\.com/[^\"']*", "data:text/javascript,", text))

@@ -32,6 +32,7 @@ def draw(suite: str, task: int, path: Path) -> None:
 
 
 def main() -> None:
+    """Draw what is missing."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suites", nargs="*", metavar="SUITE", default=SUITES)
     parser.add_argument("--force", action="store_true", help="draw images again that are there")

@@ -1,7 +1,7 @@
 """The page docs/suites.md: every LIBERO suite with its tasks, instructions and images, and LIBERO-PRO's instructions.
 
-    python scripts/suite_page.py           # writes the page; images are those of scripts/suite_images.py
-    python scripts/suite_page.py --check   # exit status 1 if the page is not up to date
+python scripts/suite_page.py           # writes the page; images are those of scripts/suite_images.py
+python scripts/suite_page.py --check   # exit status 1 if the page is not up to date
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ VARIED = {
 }
 HEAD = """# Suites
 
-All suites that LIBERO and LIBERO-PRO have, as `vecenv list` shows them. Every task has 50 stored starts. Images show the
-first one, settled, as published, upright and not mirrored (`scripts/suite_images.py`; what policies get is
+All suites that LIBERO and LIBERO-PRO have, as `vecenv list` shows them. Every task has 50 stored starts. Images show
+the first one, settled, as published, upright and not mirrored (`scripts/suite_images.py`; what policies get is
 [turned](rendering.md#which-way-up)). This page is written by `scripts/suite_page.py`. SIMPLER's tasks are in
 [SIMPLER](simpler_tasks.md).
 
@@ -68,8 +68,8 @@ def _images(suite: str) -> Iterator[str]:
 
 def _varied() -> Iterator[str]:
     yield "\n## LIBERO-PRO\n"
-    yield "Sixteen suites that vary four of LIBERO's, ten tasks each: `libero_goal_swap` is `libero_goal` with objects that"
-    yield "changed places.\n"
+    yield "Sixteen suites that vary four of LIBERO's, ten tasks each: `libero_goal_swap` is `libero_goal` with objects"
+    yield "that changed places.\n"
     yield "| suffix | what is varied |"
     yield "|---|---|"
     for suffix, about in VARIED.items():
@@ -84,6 +84,7 @@ def _varied() -> Iterator[str]:
 
 
 def main() -> None:
+    """Write the page, or compare it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing; exit status 1 if the page differs")
     text = "\n".join(lines()) + "\n"

@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import typer.main
-from support.paths import REPOSITORY
 
 import vecenv
+from support.paths import REPOSITORY
 from vecenv import cli, protocols, registry
 from vecenv.errors import MissingDependency
 
