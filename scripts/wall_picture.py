@@ -2,8 +2,8 @@
 
     python scripts/wall_picture.py [--keep DIR]
 
-Runs ``vecenv video`` (8 tasks of libero_goal with 8 episodes each, policy pick_place, at most 200 ticks) and keeps every
-eighth frame, 512 pixels wide. Prints the time and the size.
+Runs ``vecenv video`` (8 tasks of libero_goal with 8 episodes each, policy pick_place, at most 200 ticks) and keeps
+every eighth frame, 512 pixels wide. Prints the time and the size.
 """
 
 from __future__ import annotations
