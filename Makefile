@@ -22,7 +22,7 @@ TEST_ARGS ?=
 RUN := $(VENV)/bin
 PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: help setup system eval test test-heavy upstream parity bench settled lint format audit doctor dist dist-check lock clean distclean
+.PHONY: help setup system eval test test-heavy upstream parity bench settled lint format docs audit doctor dist dist-check lock clean distclean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -82,6 +82,10 @@ format: $(VENV)/.installed-dev ## Format the code and apply ruff's automatic fix
 	@$(RUN)/ruff check --fix-only
 	@$(RUN)/ruff format
 
+docs: $(VENV)/.installed-docs ## Build the documentation into ./site, strictly: a broken link or anchor is an error
+	@NO_MKDOCS_2_WARNING=1 $(RUN)/mkdocs build --strict --quiet
+	@echo "==> site/index.html"
+
 doctor: $(VENV)/.installed-eval ## Show what is installed on this machine and what is missing
 	@$(RUN)/vecenv doctor
 
@@ -101,7 +105,7 @@ lock: ## Write requirements-dev.lock: exact versions and hashes of what `make se
 		--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" $(LOCK_ARGS) --output-file requirements-dev.lock
 
 clean: ## Remove caches and build outputs; .venv and results/ stay
-	rm -rf build dist .pytest_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf build dist site .pytest_cache .ruff_cache .hypothesis *.egg-info
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 distclean: clean ## Remove .venv as well
