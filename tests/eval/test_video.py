@@ -119,6 +119,10 @@ class Countdown:
     def __init__(self) -> None:
         self.ticks, self.watchers = 0, []
 
+    @property
+    def done(self) -> np.ndarray:
+        return np.zeros(2, bool)
+
     def reset(self) -> SimpleNamespace:
         return SimpleNamespace(episode_id=("a/0/0", "a/0/1"), instruction=("do it", "do it"))
 
