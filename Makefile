@@ -20,7 +20,7 @@ LOCK_ARGS ?=
 TEST_ARGS ?=
 
 RUN := $(VENV)/bin
-PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile
+PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: help setup system eval test test-heavy upstream parity bench settled lint format docs audit doctor dist dist-check lock clean distclean
 

@@ -77,3 +77,8 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from support.simpler_files import physics_files
 
     return physics_files(tmp_path_factory.mktemp("original"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that fork come first, while the process that runs them is small."""
+    items.sort(key=lambda item: item.get_closest_marker("forks") is None)

@@ -22,6 +22,8 @@ from vecenv_eval.store import ResultStore
 
 from vecenv.cli import build_app, main
 
+pytestmark = pytest.mark.forks
+
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
