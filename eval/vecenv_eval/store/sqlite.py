@@ -12,7 +12,7 @@ import logging
 import shutil
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -122,7 +122,7 @@ class SqliteRows:
                 return {}
             query = f"SELECT {_NAMES} FROM episodes ORDER BY rowid"  # nosec B608 # names of COLUMNS
             found = connection.execute(query).fetchall()
-        records = [self._record(dict(zip(COLUMNS, values, strict=True))) for values in found]
+        records = [self._record(values) for values in found]
         return {record.key: record for record in records}
 
     def check(self) -> None:
@@ -238,17 +238,12 @@ class SqliteRows:
             raise StoreError(f"{self.path} has version {version} of the table of episodes; this vecenv reads {SCHEMA}")
         return True
 
-    def _record(self, values: Mapping[str, Any]) -> Record:
+    def _record(self, values: Sequence[Any]) -> Record:
         try:
-            flags = {name: _FLAGS.get(values[name]) for name, kind in COLUMNS.items() if kind.startswith("BOOLEAN")}
-            texts = {
-                name: parse_json(str(values[name]).encode())
-                for name, kind in COLUMNS.items()
-                if kind.startswith("JSON")
-            }
-            return from_plain({**values, **flags, **texts})
+            return from_columns(values)
         except (ValueError, TypeError) as error:
-            which = "/".join(f"{values[name]!s:.50}" for name in KEY)
+            row = dict(zip(COLUMNS, values, strict=True))
+            which = "/".join(f"{row[name]!s:.50}" for name in KEY)
             raise StoreError(f"{self.path}: the row of {which} is not an episode: {error}") from None
 
     @contextmanager
@@ -281,6 +276,21 @@ def _set_journal(connection: sqlite3.Connection, mode: str) -> str:
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.05)
+
+
+def from_columns(values: Sequence[Any]) -> Record:
+    """A record from the values of its columns, in the order of ``COLUMNS``.
+
+    Raises:
+        ValueError, TypeError: they are none; the message names the field.
+    """
+    row = dict(zip(COLUMNS, values, strict=True))
+    for name, kind in COLUMNS.items():
+        if kind.startswith("BOOLEAN"):
+            row[name] = _FLAGS.get(row[name])
+        elif kind.startswith("JSON"):
+            row[name] = parse_json(str(row[name]).encode())
+    return from_plain(row)
 
 
 def sqlite_values(row: Mapping[str, Any]) -> dict[str, Any]:
