@@ -29,12 +29,13 @@ from vecenv.interop.nodes.verbs import (
     TRIGGER,
     EePoseConfig,
     EnvTool,
-    EvaluateConfig,
+    Evaluate,
     ObserveObjects,
     StepContinuous,
     StepEePose,
     StepTool,
     camera_image,
+    metadata,
     motion_outputs,
     step_pose,
 )
@@ -42,6 +43,8 @@ from vecenv.protocols import DEFAULT
 from vecenv.slots import SlotBatch
 
 NAME = "env_libero"
+# The first field of the panel.
+_HEAD = "suite"
 # Ticks that fingers get to close.
 _CLOSE_TICKS = 60
 
@@ -62,15 +65,7 @@ class Reset(EnvTool):
 
     def execute(self, given: Mapping[str, Any], config: Any, node: str) -> dict[str, Any]:
         """Metadata of the episode."""
-        episode = self.manager.ensure_live()
-        chosen = episode.selection
-        return {
-            "instruction": episode.instruction,
-            "episode_id": f"{chosen.head}/{chosen.task}/{chosen.episode}",
-            "suite": chosen.head,
-            "task_id": chosen.task,
-            "max_steps": episode.max_steps,
-        }
+        return metadata(self.manager.ensure_live(), _HEAD)
 
 
 class EgocentricConfig(ToolConfig):
@@ -121,34 +116,15 @@ class ObserveEgocentric(EnvTool):
         return self.manager.run(job)
 
 
-class Evaluate(EnvTool):
+class LiberoEvaluate(Evaluate):
     """Read the verdict of the episode; run it once, after the loop."""
 
-    verb, display_name, family = "evaluate", "LIBERO: Evaluate", "evaluate"
-    inputs: ClassVar[tuple[Port, ...]] = (TRIGGER,)
+    display_name, head = "LIBERO: Evaluate", _HEAD
     outputs: ClassVar[tuple[Port, ...]] = (
         port("success", BOOL, "the goal held after the latest tick"),
         port("metrics", WireType.METRICS, "success (0 or 1), num_steps, suite, task_id, cumulative_reward"),
         ERROR,
     )
-    config: ClassVar[type[ToolConfig]] = EvaluateConfig
-
-    def execute(self, given: Mapping[str, Any], config: Any, node: str) -> dict[str, Any]:
-        """The verdict."""
-
-        def job(env: BatchEnv, episode: EpisodeInfo) -> dict[str, Any]:
-            found = env.evaluate()
-            success = bool(found.success[0])
-            metrics = {
-                "success": float(success),
-                "num_steps": int(found.num_steps[0]),
-                "suite": episode.selection.head,
-                "task_id": episode.selection.task,
-                "cumulative_reward": float(found.cumulative_reward[0]),
-            }
-            return {"success": success, "metrics": metrics}
-
-        return self.manager.run(job)
 
 
 class ResetToHome(StepTool):
@@ -223,7 +199,7 @@ class EnvLiberoNodeSet(EnvNodeSet):
             StepEePose,
             ObserveEgocentric,
             ObserveObjects,
-            Evaluate,
+            LiberoEvaluate,
             ResetToHome,
             CloseGripper,
         )

@@ -26,13 +26,14 @@ from vecenv.interop.nodes.verbs import (
     TRIGGER,
     ContinuousConfig,
     EnvTool,
-    EvaluateConfig,
+    Evaluate,
     ObserveObjects,
     StepContinuous,
     StepEePose,
     StepTool,
     camera_image,
     control_outputs,
+    metadata,
     step_chunk,
 )
 
@@ -50,20 +51,11 @@ _SEEN = (
     port("state", ANY, "float32: joint positions, joint velocities, pose of the base; 23 or 29 numbers"),
 )
 _BUNDLE = (_INSTRUCTION, _EPISODE_ID, *_SEEN, *_PLACE, _MAX_STEPS)
+# The first field of the panel.
+_HEAD = "split"
 _STEP_INDEX = port("step_index", ANY, "control ticks of the episode so far")
 _SUCCESS = port("success", BOOL, "the task is solved after the latest tick")
 _REWARD = port("reward", ANY, "of all ticks of this call")
-
-
-def _metadata(episode: EpisodeInfo) -> dict[str, Any]:
-    chosen: Selection = episode.selection
-    return {
-        "instruction": episode.instruction,
-        "episode_id": f"{chosen.head}/{chosen.task}/{chosen.episode}",
-        "split": chosen.head,
-        "task_id": chosen.task,
-        "max_steps": episode.max_steps,
-    }
 
 
 def _seen(env: BatchEnv) -> dict[str, Any]:
@@ -96,7 +88,7 @@ class Reset(EnvTool):
         """Metadata of the episode."""
         episode = self.manager.ensure_live()
         seen = self.manager.run(lambda env, _: _seen(env)) if config.observation else {}
-        return {**_metadata(episode), "scene_id": _scene(episode.selection), **seen}
+        return {**metadata(episode, _HEAD), "scene_id": _scene(episode.selection), **seen}
 
 
 def _scene(selection: Selection) -> str:
@@ -169,8 +161,8 @@ class Step(StepTool):
         def job(env: BatchEnv, episode: EpisodeInfo) -> dict[str, Any]:
             signals = control_outputs(step_chunk(self.manager, env, actions))
             told = {name: signals[name] for name in ("reward", "success", "step_index", "truncated")}
-            metadata = {**_metadata(episode), "instruction": env.instructions()[0]}
-            return {**metadata, **_seen(env), **told, "done": signals["terminated"] or signals["truncated"]}
+            about = {**metadata(episode, _HEAD), "instruction": env.instructions()[0]}
+            return {**about, **_seen(env), **told, "done": signals["terminated"] or signals["truncated"]}
 
         return self.manager.run(job)
 
@@ -190,7 +182,7 @@ class GetObservation(EnvTool):
     def execute(self, given: Mapping[str, Any], config: Any, node: str) -> dict[str, Any]:
         """One look."""
         return self.manager.run(
-            lambda env, episode: {**_metadata(episode), "instruction": env.instructions()[0], **_seen(env)}
+            lambda env, episode: {**metadata(episode, _HEAD), "instruction": env.instructions()[0], **_seen(env)}
         )
 
 
@@ -216,7 +208,7 @@ class EpisodeInformation(EnvTool):
         def job(env: BatchEnv, episode: EpisodeInfo) -> dict[str, Any]:
             found = env.evaluate()
             return {
-                **_metadata(episode),
+                **metadata(episode, _HEAD),
                 "instruction": env.instructions()[0],
                 "step_index": int(found.num_steps[0]),
                 "cumulative_reward": float(found.cumulative_reward[0]),
@@ -227,34 +219,15 @@ class EpisodeInformation(EnvTool):
         return self.manager.run(job)
 
 
-class Evaluate(EnvTool):
+class SimplerEvaluate(Evaluate):
     """Read the verdict of the episode; run it once, after the loop."""
 
-    verb, display_name, family = "evaluate", "SIMPLER: Evaluate", "evaluate"
-    inputs: ClassVar[tuple[Port, ...]] = (TRIGGER,)
+    display_name, head = "SIMPLER: Evaluate", _HEAD
     outputs: ClassVar[tuple[Port, ...]] = (
         _SUCCESS,
         port("metrics", WireType.METRICS, "success (0 or 1), num_steps, split, task_id, cumulative_reward"),
         ERROR,
     )
-    config: ClassVar[type[ToolConfig]] = EvaluateConfig
-
-    def execute(self, given: Mapping[str, Any], config: Any, node: str) -> dict[str, Any]:
-        """The verdict."""
-
-        def job(env: BatchEnv, episode: EpisodeInfo) -> dict[str, Any]:
-            found = env.evaluate()
-            success = bool(found.success[0])
-            metrics = {
-                "success": float(success),
-                "num_steps": int(found.num_steps[0]),
-                "split": episode.selection.head,
-                "task_id": episode.selection.task,
-                "cumulative_reward": float(found.cumulative_reward[0]),
-            }
-            return {"success": success, "metrics": metrics}
-
-        return self.manager.run(job)
 
 
 class SimplerStepEePose(StepEePose):
@@ -299,7 +272,7 @@ class EnvSimplerNodeSet(EnvNodeSet):
             Reset,
             SimplerStepContinuous,
             ObserveEgocentric,
-            Evaluate,
+            SimplerEvaluate,
             Step,
             GetObservation,
             EpisodeInformation,

@@ -57,6 +57,45 @@ class EvaluateConfig(ToolConfig):
     post_loop: bool = False
 
 
+def metadata(episode: EpisodeInfo, head: str) -> dict[str, Any]:
+    """What a reset says about an episode; ``head`` names the first field of the panel, suite or split."""
+    chosen = episode.selection
+    return {
+        "instruction": episode.instruction,
+        "episode_id": f"{chosen.head}/{chosen.task}/{chosen.episode}",
+        head: chosen.head,
+        "task_id": chosen.task,
+        "max_steps": episode.max_steps,
+    }
+
+
+class Evaluate(EnvTool):
+    """Read the verdict of the episode; run it once, after the loop. Families name it, its ports and ``head``."""
+
+    verb, family = "evaluate", "evaluate"
+    inputs: ClassVar[tuple[Port, ...]] = (TRIGGER,)
+    config: ClassVar[type[ToolConfig]] = EvaluateConfig
+    # The first field of the panel: suite or split.
+    head: ClassVar[str]
+
+    def execute(self, given: Mapping[str, Any], config: Any, node: str) -> dict[str, Any]:
+        """The verdict."""
+
+        def job(env: BatchEnv, episode: EpisodeInfo) -> dict[str, Any]:
+            found = env.evaluate()
+            success = bool(found.success[0])
+            metrics = {
+                "success": float(success),
+                "num_steps": int(found.num_steps[0]),
+                self.head: episode.selection.head,
+                "task_id": episode.selection.task,
+                "cumulative_reward": float(found.cumulative_reward[0]),
+            }
+            return {"success": success, "metrics": metrics}
+
+        return self.manager.run(job)
+
+
 class ContinuousConfig(ToolConfig):
     """``max_chunk_steps``: rows of a chunk that are executed, the first ones; 0 for all."""
 

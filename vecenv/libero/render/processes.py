@@ -216,7 +216,7 @@ class _Worker:
         with theirs:
             command = [sys.executable, "-m", _MODULE, str(theirs.fileno()), str(os.getpid())]
             try:
-                self._process = subprocess.Popen(
+                self._process = subprocess.Popen(  # nosec B603 # a module of vecenv, in this Python
                     command, pass_fds=(theirs.fileno(),), env=_environment(look.gl, count), stdin=subprocess.DEVNULL
                 )
             except OSError as error:
