@@ -8,7 +8,6 @@ wrong and 1 when the server cannot listen.
 from __future__ import annotations
 
 import logging
-import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -17,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from vecenv.cli import fail
-from vecenv.util.extras import how_to_install, is_installed
 from vecenv.util.logs import Saying, reported, to_stderr
+from vecenv_eval.cli import listening
 from vecenv_eval.cli.options import some_settings, user_errors, with_settings
 from vecenv_eval.config import EvalConfig
 
@@ -59,15 +58,10 @@ def _serve(
     out: Path | None = typer.Option(
         None, help="Folder below which every run gets a results folder.", show_default="results are not kept"
     ),
-    host: str = typer.Option("127.0.0.1", help="Address to listen on; others than loopback need a token."),
-    port: int = typer.Option(8321, min=0, max=65535, help="TCP port; 0 for a free one, which is printed."),
-    token_file: Path | None = typer.Option(
-        None,
-        help="File with the token that clients must show; also from VECENV_TOKEN. Loopback needs none, and for other "
-        "addresses one is made and printed.",
-        show_default="none",
-    ),
-    open_browser: bool = typer.Option(True, "--open/--no-open", help="Open the page in a browser."),
+    host: str = listening.HOST,
+    port: int = listening.port_option(8321),
+    token_file: Path | None = listening.TOKEN_FILE,
+    open_browser: bool = listening.OPEN,
     play: bool = typer.Option(False, "--play", help="Play at once."),
     trust_clients: bool = typer.Option(
         False,
@@ -76,7 +70,7 @@ def _serve(
         "as you.",
     ),
     max_slots: int = typer.Option(64, min=1, max=4096, help="Most slots of a batch that a client builds."),
-    allow_host: list[str] = typer.Option([], help="A further name that the server is called by; repeatable."),
+    allow_host: list[str] = listening.ALLOW_HOST,
     allow_origin: list[str] = typer.Option([], help="A further origin whose pages may call; repeatable."),
     access_log: bool = typer.Option(False, "--access-log", help="Print a line for every request."),
     view_3d: bool = typer.Option(
@@ -90,9 +84,7 @@ def _serve(
     """Drive and watch a live batch of environments in the browser."""
     if port_3d is not None and not view_3d:
         fail("--port-3d needs --view-3d")
-    for module in ("fastapi", "uvicorn", "PIL", *(["viser"] if view_3d else [])):
-        if not is_installed(module):
-            fail(how_to_install(module), code=1)
+    listening.need("fastapi", "uvicorn", "PIL", *(["viser"] if view_3d else []))
     sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
     with user_errors():
         first = _first(settings, config)
@@ -114,16 +106,11 @@ def _first(settings: dict[str, Any], file: Path | None) -> EvalConfig | None:
 def _settings(
     host: str, token_file: Path | None, trust: bool, max_slots: int, hosts: list[str], origins: list[str]
 ) -> ServeSettings:
-    """Settings of the server; a token is made where one is needed and none was given."""
-    from vecenv_eval.web.settings import ServeSettings, is_loopback, new_token, read_token
+    from vecenv_eval.web.settings import ServeSettings
 
-    token = read_token(token_file)
-    if token is None and not is_loopback(host):
-        token = new_token()
-        typer.echo(f"token: {token}", err=True)
     return ServeSettings(
         host=host,
-        token=token,
+        token=listening.token_of(host, token_file),
         allowed_hosts=tuple(hosts),
         allowed_origins=tuple(origins),
         trust_clients=trust,
@@ -149,10 +136,7 @@ def _run(
 
     if first is not None:
         check_live(first)
-    # A shell that starts it in the background makes it deaf to Ctrl-C's signal; `kill -INT` must still stop it. After
-    # SIGTERM too the session is closed, and what has ended summarised.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+    listening.heed_signals()  # after SIGTERM too the session is closed, and what has ended summarised
     if access_log:
         logger = logging.getLogger("vecenv_eval.web.access")
         logger.setLevel(logging.INFO)
@@ -176,16 +160,8 @@ def _run(
             attach_view3d(app, session, scene)
         server = Server(app, ports[0])
 
-        def started() -> None:
-            typer.echo(f"serving on {server.url}" + (" (the page asks for the token)" if settings.token else ""))
-            sys.stdout.flush()
-            if open_browser:
-                import webbrowser
-
-                webbrowser.open(server.url)
-
-        server.on_start(started)
-        server.run()  # uvicorn raises the signal again when it has stopped
+        asks = " (the page asks for the token)" if settings.token else ""
+        listening.run(server, lambda address: f"serving on {address}{asks}", open_browser=open_browser)
     typer.echo("stopped")
 
 

@@ -7,16 +7,13 @@ listen or a package is missing.
 
 from __future__ import annotations
 
-import signal
-import sys
-from contextlib import suppress
 from pathlib import Path
 
 import typer
 
 from vecenv.cli import fail
 from vecenv.errors import VecenvError
-from vecenv.util.extras import how_to_install, is_installed
+from vecenv_eval.cli import listening
 
 # Requests a second of one address: a page that plays two recordings asks for 40 images.
 _REQUESTS_PER_S = 200.0
@@ -27,34 +24,27 @@ def view_command(
         ..., help="Results folder of `vecenv eval`, a folder of them (suites, seeds, shards), or a name in ./results."
     ),
     other: Path | None = typer.Argument(None, help="A second one, shown beside it.", show_default="none"),
-    host: str = typer.Option("127.0.0.1", help="Address to listen on; others than loopback need a token."),
-    port: int = typer.Option(8322, min=0, max=65535, help="TCP port; 0 for a free one, which is printed."),
-    token_file: Path | None = typer.Option(
-        None,
-        help="File with the token that readers must show; also from VECENV_TOKEN. Loopback needs none, and for other "
-        "addresses one is made and printed.",
-        show_default="none",
-    ),
-    open_browser: bool = typer.Option(True, "--open/--no-open", help="Open the page in a browser."),
-    allow_host: list[str] = typer.Option([], help="A further name that the server is called by; repeatable."),
+    host: str = listening.HOST,
+    port: int = listening.port_option(8322),
+    token_file: Path | None = listening.TOKEN_FILE,
+    open_browser: bool = listening.OPEN,
+    allow_host: list[str] = listening.ALLOW_HOST,
 ) -> None:
     """Look at evaluations in the browser, while they run and afterwards: success, episodes, recordings, two runs."""
-    for module in ("fastapi", "uvicorn", "PIL", "av", "h5py"):
-        if not is_installed(module):
-            fail(how_to_install(module), code=1)
+    listening.need("fastapi", "uvicorn", "PIL", "av", "h5py")
     from vecenv_eval.store import StoreError
     from vecenv_eval.web.runs import open_runs
     from vecenv_eval.web.server import ServerError
-    from vecenv_eval.web.settings import ServeSettings, is_loopback, new_token, read_token
+    from vecenv_eval.web.settings import ServeSettings
 
     try:
         readers = open_runs([each for each in (folder, other) if each is not None])
-        token = read_token(token_file)
-        if token is None and not is_loopback(host):
-            token = new_token()
-            typer.echo(f"token: {token}", err=True)
         settings = ServeSettings(
-            host=host, token=token, allowed_hosts=tuple(allow_host), requests_per_second=_REQUESTS_PER_S, nodes=False
+            host=host,
+            token=listening.token_of(host, token_file),
+            allowed_hosts=tuple(allow_host),
+            requests_per_second=_REQUESTS_PER_S,
+            nodes=False,
         )
     except (StoreError, VecenvError) as error:
         fail(" ".join(str(error).split()))
@@ -62,24 +52,12 @@ def view_command(
     from vecenv_eval.web.routes_runs import runs_router
     from vecenv_eval.web.server import Server
 
-    # A shell that starts it in the background makes it deaf to Ctrl-C's signal; `kill -INT` must still stop it.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+    listening.heed_signals()
     try:
         server = Server(create_app(None, settings, routers=[runs_router(readers)]), port)
     except ServerError as error:
         fail(str(error), code=1)
 
-    def started() -> None:
-        address = f"{server.url}/view"
-        typer.echo(f"viewing {' and '.join(str(each.folder) for each in readers)} on {address}")
-        sys.stdout.flush()
-        if open_browser:
-            import webbrowser
-
-            webbrowser.open(address)
-
-    server.on_start(started)
-    with suppress(KeyboardInterrupt):  # uvicorn raises the signal again when it has stopped
-        server.run()
+    folders = " and ".join(str(each.folder) for each in readers)
+    listening.run(server, lambda address: f"viewing {folders} on {address}", path="/view", open_browser=open_browser)
     typer.echo("stopped")

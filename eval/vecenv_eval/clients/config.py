@@ -6,6 +6,7 @@ names the option. Each client derives its own config from ``ServerConfig``.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
@@ -26,7 +27,8 @@ class ServerConfig:
     Attributes:
         host: name or address of the server; a websocket URL (``ws://...``, ``wss://...``) is used as it is.
         port: TCP port; 0 with a URL that has one.
-        api_key: sent to servers that ask for one; empty for none.
+        api_key_env: environment variable that holds the key for a server that asks for one; empty for none. The key
+            itself is no option, because options are stored with the results.
         connections: most requests in flight; each has a connection of its own. 1 for servers that take one at a time.
         timeout_s: seconds to wait for an answer. A request that timed out is not sent again: it may still be running.
         connect_timeout_s: seconds to wait for one connection to open.
@@ -38,7 +40,7 @@ class ServerConfig:
 
     host: str = "127.0.0.1"
     port: int = 8000
-    api_key: str = ""
+    api_key_env: str = ""
     connections: int = 1
     timeout_s: float = 120.0
     connect_timeout_s: float = 10.0
@@ -58,6 +60,13 @@ class ServerConfig:
                 raise PolicyError(f"{name}={getattr(self, name)}: expected a positive number of seconds")
         if self.gripper not in GRIPPERS:
             raise PolicyError(f"gripper={self.gripper!r}: expected one of {', '.join(GRIPPERS)}")
+        if self.api_key_env and not self.api_key:
+            raise PolicyError(f"api_key_env={self.api_key_env}: there is no such environment variable, or it is empty")
+
+    @property
+    def api_key(self) -> str:
+        """The server's key, empty for none."""
+        return os.environ.get(self.api_key_env, "") if self.api_key_env else ""
 
     @property
     def address(self) -> str:
@@ -76,4 +85,9 @@ def build(kind: type[_Config], name: str, options: Mapping[str, object]) -> _Con
     Raises:
         PolicyError: an option that the client does not have, or a value that it cannot use.
     """
+    if "api_key" in options:
+        raise PolicyError(
+            f"policy {name!r}: api_key is not taken, because options are stored with the results: put the key into an "
+            "environment variable and give that one's name, --policy-arg api_key_env=NAME"
+        )
     return configs.build(kind, options, what=f"policy {name!r}", error=PolicyError)

@@ -140,6 +140,20 @@ def test_the_server_is_told_when_a_batch_begins() -> None:
     assert [endpoint for endpoint, _ in server.seen] == ["get_modality_config", "ping", "reset", "get_action"]
 
 
+def test_the_key_is_read_from_the_environment_and_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    tokens: list[object] = []
+
+    class Guarded(Server):
+        def __call__(self, data: bytes) -> object:
+            tokens.append(codec.unpack_with_release(data)[0].get("api_token"))
+            return super().__call__(data)
+
+    monkeypatch.setenv("SERVER_KEY", "sesame")
+    with rep_server(Guarded()) as port:
+        acted(port, SeeingEnv([1], [0]), api_key_env="SERVER_KEY")
+    assert set(tokens) == {"sesame"}
+
+
 def test_an_error_is_the_servers() -> None:
     class Failing(Server):
         def actions(self, observation: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -252,11 +252,31 @@ def test_an_environment_without_a_wrist_camera_needs_wrist_key_empty() -> None:
         ({"connections": 0}, "connections=0: expected at least 1"),
         ({"timeout_s": 0}, "expected a positive number"),
         ({"gripper": "left"}, "expected one of as_is, sign, open_above_half"),
+        ({"api_key": "sesame"}, "api_key is not taken"),
+        ({"api_key_env": "NOT_THERE"}, "api_key_env=NOT_THERE: there is no such environment variable"),
     ],
 )
 def test_wrong_options_are_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(PolicyError, match=message):
         make_policy("openpi", **options)
+
+
+def test_the_key_is_read_from_the_environment_and_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    def handle(host: WebSocketHost, connection: ServerConnection, number: int) -> None:
+        assert connection.request is not None
+        host.seen.append(connection.request.headers.get("Authorization"))
+        connection.send(numpy_msgpack.pack({}))
+        for _ in messages(connection):
+            connection.send(numpy_msgpack.pack({"actions": chunk(0)}))
+
+    monkeypatch.setenv("SERVER_KEY", "sesame")
+    with websocket_host(handle) as host:
+        for options in ({"api_key_env": "SERVER_KEY"}, {}):
+            env = SeeingEnv([1], [0])
+            policy = started(policy_of(host.port, **options), env)
+            policy.act(env)
+            policy.close()
+    assert host.seen == ["Api-Key sesame", None]
 
 
 def test_the_harness_counts_a_server_that_fails_as_errors_not_as_failures(tmp_path: Path) -> None:
