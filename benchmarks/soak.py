@@ -1,7 +1,8 @@
 """Whether memory, file handles and threads of a process stay as they are while it works for long.
 
 Two parts, each for half of the time. ``evaluation``: one evaluation after the other, each with an environment of its
-own, slots that are filled again when their episode ends, and a camera image of every slot read at every tick.
+own, slots that are filled again when their episode ends, and a camera image of every slot read at every tick. Each is
+interrupted on the way, as by Ctrl-C, and resumed from its folder.
 ``batch``: one environment whose episodes run to their budget, started again and again, with random actions. A row is
 what the process holds at one moment; the last lines compare the end of each part with its first third.
 
@@ -14,6 +15,7 @@ import argparse
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ import psutil
 from common import report
 from vecenv_eval.config import EvalConfig
 from vecenv_eval.policies.random import RandomPolicy
+from vecenv_eval.results import Progress
 from vecenv_eval.runner import evaluate
 
 import vecenv
@@ -86,20 +89,40 @@ class Meter:
             self.note()
 
 
+class Interruption:
+    """Presses Ctrl-C once so many episodes have ended.
+
+    Args:
+        after: how many.
+    """
+
+    def __init__(self, after: int) -> None:
+        self._after = after
+
+    def __call__(self, progress: Progress) -> None:
+        """Look at how far the evaluation is."""
+        if progress.done >= self._after:
+            raise KeyboardInterrupt
+
+
 def evaluations(meter: Meter, until: float, *, tasks: str, slots: int, budget: int, size: int) -> None:
-    """Evaluate, again and again, with refills and images."""
+    """Evaluate, again and again, with refills and images; each evaluation in two goes."""
+    config = EvalConfig(
+        suite=SUITE,
+        tasks=tasks,
+        episodes=str(slots + 1),
+        policy="soak:LookingPolicy",
+        max_steps=budget,
+        num_envs=slots,
+        image_size=size,
+    )
     while time.monotonic() < until:
-        config = EvalConfig(
-            suite=SUITE,
-            tasks=tasks,
-            episodes=str(slots + 1),
-            policy="soak:LookingPolicy",
-            max_steps=budget,
-            num_envs=slots,
-            image_size=size,
-        )
         with tempfile.TemporaryDirectory() as folder:
-            result = evaluate(config, Path(folder) / "run")
+            run = Path(folder) / "run"
+            with suppress(KeyboardInterrupt):
+                evaluate(config, run, on_progress=Interruption(slots))
+                raise SystemExit("the evaluation was not interrupted")
+            result = evaluate(config, run)
         meter.episodes += len(result.records)
         meter.ticks += sum(record.num_steps for record in result.records)
 

@@ -168,6 +168,17 @@ def test_history_has_a_row_a_tick_and_begins_anew_with_the_episode() -> None:
             live.history(3)
 
 
+def test_history_ends_where_the_episode_ended() -> None:
+    with session(config=config(tasks="0", episodes="1", num_envs=1)) as live:
+        live.wait_until("ready", timeout=20)
+        live.act("play")
+        live.wait_until("finished", timeout=20)
+        (slot,), history = live.state().slots, live.history(0)
+    assert len(history.action) == slot.step
+    assert len(history.step) == len(history.reward) == slot.step + 1
+    assert history.reward[-1] == slot.reward
+
+
 def test_what_cannot_be_done_in_a_state_is_refused_with_the_reason() -> None:
     with Session(simulator=LiveWorld().simulator) as live:
         assert live.state().state == "idle"

@@ -99,6 +99,9 @@ def test_a_silent_writer_loses_what_it_holds_and_one_that_shows_itself_keeps_it(
     now[0] = 120.0
     writers.claim("session", "two")
     assert not writers.holds("session", "one")
+    now[0] = 240.0
+    writers.touch(None)  # a reader without a name, after the writer has fallen silent
+    assert not writers.is_held("session")
 
 
 @pytest.mark.parametrize(

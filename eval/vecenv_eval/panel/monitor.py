@@ -23,6 +23,7 @@ from vecenv_eval.watch import Observable
 MOST_ROWS = 5000
 # Columns of a row: position of the hand, opening of the gripper, reward, action.
 _WIDTH = 3 + 1 + 1 + 7
+_GRIPPER, _REWARD, _ACTION = 3, 4, 5
 _DECIMALS = 5
 
 
@@ -103,9 +104,11 @@ class Monitor:
 
     def finish(self, env: BatchEnv, records: Mapping[int, Record]) -> None:
         """Episodes have ended; the environment still shows their end."""
+        rows = self._look(env)
         with self._lock:
             for slot, record in records.items():
                 self._end(slot, record)
+                self._append(slot, rows[slot])
             self._changed(list(records))
         self._on_end(env, list(records))
 
@@ -136,19 +139,24 @@ class Monitor:
             self._steps[slot], self._reward[slot] = record.num_steps, record.reward or 0.0
 
     def _note(self, env: BatchEnv, slots: Sequence[int], actions: np.ndarray) -> None:
-        reward = np.asarray(env.evaluate().cumulative_reward)
-        rows = np.full((env.num_envs, _WIDTH), np.nan, np.float32)
-        if isinstance(env, SlotBatch):
-            rows[:, :3] = env.ee_poses[:, :3]
-        rows[:, 3] = _opening(env)
-        rows[:, 4], rows[:, 5:] = reward, actions
+        rows = self._look(env)
+        rows[:, _ACTION:] = actions
         with self._lock:
             self.tick += 1
             for slot in slots:
                 self._append(slot, rows[slot])
             self._steps[list(slots)] += 1
-            self._reward[list(slots)] = reward[list(slots)]
+            self._reward[list(slots)] = rows[list(slots), _REWARD]
             self._changed(slots)
+
+    @staticmethod
+    def _look(env: BatchEnv) -> np.ndarray:
+        """A row of every slot as it is now, without an action."""
+        rows = np.full((env.num_envs, _WIDTH), np.nan, np.float32)
+        if isinstance(env, SlotBatch):
+            rows[:, :3] = env.ee_poses[:, :3]
+        rows[:, _GRIPPER], rows[:, _REWARD] = _opening(env), env.evaluate().cumulative_reward
+        return rows
 
     def _append(self, slot: int, row: np.ndarray) -> None:
         count = self._count[slot]
@@ -194,16 +202,16 @@ class Monitor:
                 return None
             rows = self._rows[slot][: self._count[slot]].copy()
             episode = self._id(slot)
-        known = np.atleast_1d(np.isfinite(rows).all(axis=0))
+        known = np.atleast_1d(np.isfinite(rows[:, :_ACTION]).all(axis=0))
         rounded = np.round(rows.astype(float), _DECIMALS)
         return History(
             slot=slot,
             episode_id=episode,
             step=tuple(range(len(rows))),
             eef_pos=tuple(map(tuple, rounded[:, :3].tolist())) if known[:3].all() else (),
-            gripper=tuple(rounded[:, 3].tolist()) if known[3] else (),
-            reward=tuple(rounded[:, 4].tolist()),
-            action=tuple(map(tuple, rounded[:, 5:].tolist())),
+            gripper=tuple(rounded[:, _GRIPPER].tolist()) if known[_GRIPPER] else (),
+            reward=tuple(rounded[:, _REWARD].tolist()),
+            action=tuple(map(tuple, rounded[~np.isnan(rows[:, _ACTION:]).all(axis=1), _ACTION:].tolist())),
         )
 
     def _slot(self, slot: int) -> SlotState:

@@ -184,6 +184,8 @@ class SessionState:
 class History:
     """Columns of the episode that a slot runs, or ran last; one row a control tick, taken before the tick.
 
+    An episode that has ended has one more, which is where it ended, and no action.
+
     Attributes:
         slot: the slot.
         episode_id: the episode.
@@ -191,7 +193,7 @@ class History:
         eef_pos: position of the end effector, xyz in metres, world frame; empty where the environment does not say.
         gripper: opening of the gripper, metres; empty where the environment does not say.
         reward: sum of rewards so far.
-        action: what was executed, 7 numbers.
+        action: what was executed, 7 numbers; none for the last row of an episode that has ended.
     """
 
     slot: int

@@ -58,7 +58,9 @@ class Writers:
             self._held[what] = (name, self._clock())
 
     def touch(self, name: str | None) -> None:
-        """A client has shown itself: what it holds stays its own."""
+        """A client has shown itself: what it holds stays its own. Nothing comes of None, a client without a name."""
+        if name is None:
+            return
         with self._lock:
             for what in [each for each in tuple(self._held) if self._holder(each) == name]:
                 self._held[what] = (self._held[what][0], self._clock())
