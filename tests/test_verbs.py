@@ -271,7 +271,7 @@ def run(verbs: type[Verbs], examples: int, calls: int) -> None:
 
 
 def test_calls_in_any_order_keep_the_rules(verbs: type[Verbs]) -> None:
-    run(verbs, 20, 50)
+    run(verbs, 26, 50)
     assert verbs.calls >= 1000
 
 

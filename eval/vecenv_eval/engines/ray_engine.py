@@ -12,7 +12,9 @@ begins the next suite in seconds.
 from __future__ import annotations
 
 import os
+import signal
 import socket
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -378,6 +380,16 @@ def _check_address(address: str | None) -> None:
         raise EngineError(f"no Ray cluster at {address}: {error}") from None
 
 
+def connect(**settings: Any) -> None:
+    """``ray.init``, but for the handler of SIGTERM, which it replaces by one that ends the process at once."""
+    usual = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(**settings)
+    finally:
+        if usual is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, usual)
+
+
 @contextmanager
 def _connected(options: RayOptions, wanted: dict[str, float]) -> Iterator[None]:
     """Connected to a cluster, or with an instance of this process's own, which ends with it.
@@ -401,7 +413,7 @@ def _connected(options: RayOptions, wanted: dict[str, float]) -> Iterator[None]:
             "include_dashboard": False,
         }
     try:
-        ray.init(**(settings if options.address is None else {**settings, "address": options.address}))
+        connect(**(settings if options.address is None else {**settings, "address": options.address}))
     except (RayError, ConnectionError, ValueError, RuntimeError, OSError) as error:
         where = "here" if options.address is None else f"at {options.address}"
         raise EngineError(f"no Ray instance {where}: {' '.join(str(error).split())}") from error

@@ -22,7 +22,7 @@ from vecenv_eval.store import EPISODES
 ray = pytest.importorskip("ray")
 pytest.importorskip("ray.cluster_utils")
 
-from vecenv_eval.engines.ray_engine import RayEngine  # noqa: E402
+from vecenv_eval.engines.ray_engine import RayEngine, connect  # noqa: E402
 from vecenv_eval.engines.ray_options import RayOptions, resources, room  # noqa: E402
 
 SLOW = "support.slow_policy:SlowPolicy"
@@ -68,7 +68,7 @@ def local(folder: Path, world: FakeWorld, **settings: Any) -> EvalResult:
 def cluster() -> Iterator[Any]:
     """A Ray instance with two CPUs, to which this process is connected."""
     with ray_cluster(2) as nodes:
-        ray.init(address=nodes.address, log_to_driver=False, logging_level="ERROR")
+        connect(address=nodes.address, log_to_driver=False, logging_level="ERROR")
         yield ray
         ray.shutdown()
 

@@ -62,7 +62,7 @@ class Kills:
 
 
 def test_a_node_that_is_killed_costs_no_verdict(tmp_path: Path, nodes: ClusterProcess) -> None:
-    kill = Kills(nodes, 4)
+    kill, usual = Kills(nodes, 4), signal.getsignal(signal.SIGTERM)
     arguments = {"address": nodes.address, "unit": 3}
     meeting = tmp_path / "meeting"
     meeting.mkdir()
@@ -80,6 +80,7 @@ def test_a_node_that_is_killed_costs_no_verdict(tmp_path: Path, nodes: ClusterPr
     assert result.ok
     assert lines(result.folder) == 20
     assert verdicts(result) == verdicts(local(tmp_path / "local"))
+    assert signal.getsignal(signal.SIGTERM) is usual
 
 
 @pytest.mark.heavy
