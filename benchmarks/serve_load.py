@@ -117,7 +117,14 @@ async def crowd(members: list[Callable[[], Any]]) -> AsyncIterator[None]:
 
 
 async def measure(
-    name: str, address: str, server: psutil.Process, seconds: float, readers: int, slow: int, vanishing: int
+    name: str,
+    address: str,
+    server: psutil.Process,
+    seconds: float,
+    readers: int,
+    slow: int,
+    vanishing: int,
+    settle: float = 5.0,
 ) -> dict[str, Any]:
     """One row: a phase with a crowd of readers."""
     url, got, latencies = address.replace("http", "ws", 1) + "/api/stream", Received(), []
@@ -125,7 +132,7 @@ async def measure(
     members += [lambda n=n: read(url, n, Received(), slow=True) for n in range(slow)]
     members += [lambda n=n: vanish(url, n) for n in range(vanishing)]
     async with crowd(members):
-        await asyncio.sleep(5.0 if members else 1.0)  # until all are connected
+        await asyncio.sleep(settle)  # until all are connected, and those of the phase before are gone
         before = got.frames, got.walls, got.states, got.size
         async with crowd([lambda: ask(address, latencies)]), httpx.AsyncClient(base_url=address, timeout=60) as client:
             first, cpu, began = (await client.get("/api/session")).json(), sum(server.cpu_times()[:2]), time.monotonic()
@@ -186,7 +193,7 @@ async def run(address: str, server: psutil.Process, seconds: float, readers: int
         await measure("one reader", address, server, seconds / 2, 1, 0, 0),
         await measure("readers", address, server, seconds, readers, 0, 0),
         await measure("readers, some hostile", address, server, seconds, readers - 40, 20, 20),
-        await measure("nobody again", address, server, seconds / 2, 0, 0, 0),
+        await measure("nobody again", address, server, seconds / 2, 0, 0, 0, settle=25.0),
     ]
 
 
