@@ -15,7 +15,6 @@ import argparse
 import tempfile
 import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -119,10 +118,9 @@ def evaluations(meter: Meter, until: float, *, tasks: str, slots: int, budget: i
     while time.monotonic() < until:
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "run"
-            with suppress(KeyboardInterrupt):
-                evaluate(config, run, on_progress=Interruption(slots))
-                raise SystemExit("the evaluation was not interrupted")
+            assert evaluate(config, run, on_progress=Interruption(slots)).interrupted
             result = evaluate(config, run)
+            assert result.ok
         meter.episodes += len(result.records)
         meter.ticks += sum(record.num_steps for record in result.records)
 
