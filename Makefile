@@ -20,7 +20,8 @@ LOCK_ARGS ?=
 TEST_ARGS ?=
 
 RUN := $(VENV)/bin
-PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+# A worker that dies ends the run: with another in its place, xdist may wait forever.
+PYTEST := $(RUN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 .PHONY: help setup system eval test test-heavy upstream parity bench settled lint format docs audit doctor dist dist-check lock clean distclean
 
