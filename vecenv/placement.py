@@ -229,6 +229,27 @@ def each(tasks: object, episodes: object, current: Placement, *, num_tasks: int,
     return Placement(*columns)
 
 
+def replaced(chosen: Sequence[int], rows: np.ndarray, current: np.ndarray, what: str) -> list[int]:
+    """Indices ``current`` (int [B]) with others in the slots ``rows``: one a slot, or a single one for all of them.
+
+    Args:
+        chosen: the others.
+        rows: int [n].
+        current: of all slots.
+        what: what an index is, for messages.
+
+    Raises:
+        PlacementError: a number of them other than the number of slots.
+    """
+    chosen = [*chosen] * len(rows) if len(chosen) == 1 else chosen
+    if len(chosen) != len(rows):
+        raise PlacementError(f"{len(chosen)} {what}s for {len(rows)} slots; expected one a slot, or a single one")
+    merged = current.tolist()
+    for row, index in zip(rows.tolist(), chosen, strict=True):
+        merged[row] = index
+    return merged
+
+
 def _parse_indices(spec: str, count: int, what: str, names: Sequence[str] = ()) -> tuple[int, ...]:
     parts = [part.strip() for part in spec.split(",") if part.strip()]
     if not parts:

@@ -1,19 +1,18 @@
-"""State that every environment keeps per slot: live or finished, success, step counts, and failures of the physics.
+"""What every environment does alike with its slots: the methods of ``vecenv.contract`` that depend on no simulator.
 
-A subclass supplies the simulator. This class implements the methods of ``vecenv.contract`` that do not depend on it,
-and the rules about finished and quarantined slots.
+A subclass of :class:`SlotBatch` supplies the simulator. How the slots stand, and the rules about finished and
+quarantined ones, are in ``vecenv.slot_states``; who may use a batch, and for how long, in ``vecenv.lifetime``.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, ClassVar, NoReturn, Self, SupportsIndex, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +21,9 @@ from vecenv import actions as action_space
 from vecenv import placement as placing
 from vecenv.contract import FIRST, Control, EePoseControl, Metrics, PlanControl, ResetInfo, Timings, Watcher
 from vecenv.controllers.waypoint import WaypointPlan
+from vecenv.lifetime import Closeable
 from vecenv.placement import Placement, PlacementError
+from vecenv.slot_states import SlotStates
 from vecenv.util import inputs
 
 log = logging.getLogger(__name__)
@@ -34,7 +35,7 @@ _LISTED = 8
 _NOWHERE = Placement(np.zeros(1, int), np.zeros(1, int))
 
 
-class SlotBatch(ABC):
+class SlotBatch(Closeable):
     """A batch of slots, each with one episode of one task; a subclass supplies the simulator and the other methods.
 
     Args:
@@ -43,14 +44,10 @@ class SlotBatch(ABC):
         success: ``"first"`` ends an episode when its goal first holds; ``"final"`` runs it until the budget is spent.
     """
 
-    # Raised by calls that are not possible in the present state.
-    _error: ClassVar[type[ValueError]]
-
     def __init__(self, suite: str, num_envs: int, *, success: str = FIRST) -> None:
+        super().__init__()
         self.suite, self.num_envs = suite, num_envs
         self._until_success = success == FIRST
-        self._closed = False
-        self._process = os.getpid()
         self._watchers: list[Watcher] = []
         self._placement = _NOWHERE
         self._physics_s = 0.0
@@ -157,21 +154,14 @@ class SlotBatch(ABC):
         """A value for each of B slots: ``given`` for the slots ``rows``, the current one for the others."""
         if given is None:
             return None
-        values = list(self._task_indices(given) if what == "task" else placing.integers(given, what))
-        values = values * len(rows) if len(values) == 1 else values
-        if len(values) != len(rows):
-            raise PlacementError(f"{len(values)} {what}s for {len(rows)} slots; expected one a slot, or a single one")
-        merged: list[int] = getattr(self._placement, what).tolist()
-        for row, value in zip(rows.tolist(), values, strict=True):
-            merged[row] = value
-        return merged
+        chosen = self._task_indices(given) if what == "task" else placing.integers(given, what)
+        return placing.replaced(chosen, rows, getattr(self._placement, what), what)
 
     def _replace(self, rows: np.ndarray, placement: Placement) -> None:
         """Place other episodes in some slots; the others keep their state."""
         with self._placed_at(placement):
-            self._max_steps[rows] = self._prepare_slots(rows)
-        self._live[rows] = False
-        self._clear(rows)
+            max_steps = self._prepare_slots(rows)
+        self._states.replace(rows, max_steps)
 
     @contextmanager
     def _placed_at(self, placement: Placement) -> Iterator[None]:
@@ -189,16 +179,8 @@ class SlotBatch(ABC):
 
     def _place(self, placement: Placement) -> None:
         with self._placed_at(placement):
-            self._max_steps = self._prepare()
-        b = self.num_envs
-        self._live = np.zeros(b, bool)
-        self._terminated = np.zeros(b, bool)
-        self._truncated = np.zeros(b, bool)
-        self._success = np.zeros(b, bool)
-        self._solved = np.zeros(b, bool)
-        self._steps = np.zeros(b, int)
-        self._reward = np.zeros(b)
-        self._fault = [""] * b
+            max_steps = self._prepare()
+        self._states = SlotStates(max_steps, until_success=self._until_success)
 
     def reset(self) -> ResetInfo:
         """Make every slot live: finished slots start their episode again, live ones are not changed.
@@ -209,11 +191,11 @@ class SlotBatch(ABC):
             Episode metadata of every slot; no observation.
         """
         self._check_open()
-        stale = ~self._live | self.done
+        stale = ~self._states.live | self.done
         if stale.any():
             with self._stepping():
                 self._arm(stale)
-            self._begin(stale)
+            self._states.begin(stale, self._failures())
             self._warn_of_failed_starts(stale)
         tasks, episodes = self._placement.task, self._placement.episode
         info = ResetInfo(
@@ -224,24 +206,12 @@ class SlotBatch(ABC):
             ),
             suite=self.suite,
             task_id=tasks.copy(),
-            max_steps=self._max_steps.copy(),
+            max_steps=self._states.max_steps.copy(),
         )
         return self._delivered(info)
 
-    def _begin(self, stale: np.ndarray) -> None:
-        self._clear(np.flatnonzero(stale))
-        self._live |= stale
-        self._quarantine(stale)
-
-    def _clear(self, rows: np.ndarray) -> None:
-        """No tick, reward, verdict or fault in some slots."""
-        for array in (self._terminated, self._truncated, self._success, self._solved, self._steps, self._reward):
-            array[rows] = 0
-        for slot in rows.tolist():
-            self._fault[slot] = ""
-
     def _warn_of_failed_starts(self, stale: np.ndarray) -> None:
-        causes = Counter(self._fault[slot] for slot in np.flatnonzero(stale) if self._fault[slot])
+        causes = Counter(self._states.fault[slot] for slot in np.flatnonzero(stale) if self._states.fault[slot])
         for cause, count in causes.items():
             message = "%r: %d of %d slots failed in reset and are done before their first tick: %s"
             log.warning(message, self, count, self.num_envs, cause)
@@ -256,8 +226,7 @@ class SlotBatch(ABC):
             PlacementError: a mask of another length, or a slot that does not exist.
         """
         self._check_live()
-        rows = self.slot_indices(slots)
-        self._truncated[rows] |= ~self._terminated[rows]
+        self._states.end(self.slot_indices(slots))
 
     def instructions(self) -> tuple[str, ...]:
         """The current instruction of each slot; SIMPLER tasks in two halves have two, one after the other."""
@@ -266,7 +235,7 @@ class SlotBatch(ABC):
     @property
     def max_steps(self) -> np.ndarray:
         """Step budget of each slot in control ticks, int [B], a copy."""
-        return self._max_steps.copy()
+        return self._states.max_steps.copy()
 
     @property
     def ee_poses(self) -> np.ndarray:
@@ -330,7 +299,7 @@ class SlotBatch(ABC):
         carries = action_space.flags(given["carry"], self.num_envs, "carry")
         if given["slots"] is not None:
             moves = moves & np.isin(np.arange(self.num_envs), self.slot_indices(given["slots"]))
-        before = self._steps.copy()
+        before = self._states.steps.copy()
         with self._stepping():
             reward, arrived = self._drive(targets, hold, moves, carries)
         return self._control(
@@ -339,7 +308,7 @@ class SlotBatch(ABC):
             before,
             converged=arrived & moves,
             final_pose=self._tools(),
-            step_count=self._steps - before,
+            step_count=self._states.steps - before,
             error=errors,
         )
 
@@ -362,7 +331,7 @@ class SlotBatch(ABC):
         checked, errors = action_space.plan(plan, self.num_envs)
         if max_misses is not None:
             max_misses = inputs.count(max_misses, "max_misses", action_space.ActionError, least=1)
-        before = self._steps.copy()
+        before = self._states.steps.copy()
         with self._stepping():
             reward, arrived, ticks = self._follow(checked, max_misses)
         return self._control(
@@ -425,26 +394,11 @@ class SlotBatch(ABC):
         Returns:
             Rewards, [B]: 1 where the goal held for the first time in the episode.
         """
-        active = ticks > 0
-        self._steps += ticks
-        spent = active & (self._steps >= self._max_steps)
-        before = self._solved.copy()
-        self._success[active] = success[active]
-        self._solved |= active & (success if solved is None else solved)
-        self._terminated |= success & (active if self._until_success else spent)
-        self._truncated |= spent & ~success
-        self._quarantine(active)
-        # A quarantined slot has no success and no reward.
-        reward = np.where(self._solved & ~before, 1.0, 0.0)
-        self._reward += reward
-        return reward
+        return self._states.book(ticks, success, self._failures(), solved)
 
     def _quarantine(self, among: np.ndarray) -> None:
-        for slot, reason in self._failures().items():
-            if among[slot] and not self._fault[slot]:
-                self._fault[slot] = reason
-                self._truncated[slot] = True
-                self._terminated[slot] = self._success[slot] = self._solved[slot] = False
+        """End those of the slots ``among`` (bool [B]) whose physics failed."""
+        self._states.quarantine(among, self._failures())
 
     def _control(
         self,
@@ -457,16 +411,16 @@ class SlotBatch(ABC):
         """The return value of a step: ``before`` are the step counts before it; ``sanitized`` is False unless given."""
         info = {
             "sanitized": np.zeros(self.num_envs, bool) if sanitized is None else sanitized,
-            "fault": tuple(self._fault),
-            "ticks": self._steps - before,
+            "fault": tuple(self._states.fault),
+            "ticks": self._states.steps - before,
             **self._diagnostics(),
         }
         control = kind(
             reward=reward,
-            terminated=self._terminated.copy(),
-            truncated=self._truncated.copy(),
-            success=self._success.copy(),
-            step_index=self._steps.copy(),
+            terminated=self._states.terminated.copy(),
+            truncated=self._states.truncated.copy(),
+            success=self._states.success.copy(),
+            step_index=self._states.steps.copy(),
             info=info,
             **extra,
         )
@@ -482,61 +436,34 @@ class SlotBatch(ABC):
         """The verdict of each slot as of its last executed tick."""
         self._check_open()
         metrics = Metrics(
-            success=self._success.copy(),
-            num_steps=self._steps.copy(),
+            success=self._states.success.copy(),
+            num_steps=self._states.steps.copy(),
             suite=self.suite,
             task_id=self._placement.task.copy(),
-            cumulative_reward=self._reward.copy(),
-            success_first=self._solved.copy(),
-            success_final=self._success.copy(),
+            cumulative_reward=self._states.reward.copy(),
+            success_first=self._states.solved.copy(),
+            success_final=self._states.success.copy(),
         )
         return self._delivered(metrics)
 
     @property
     def done(self) -> np.ndarray:
         """Slots that have finished their episode, bool [B]."""
-        return self._terminated | self._truncated
-
-    def close(self) -> None:
-        """Release the simulator; closing twice is harmless."""
-        self._closed = True
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return self._states.done
 
     def __repr__(self) -> str:
         about = [f"{self.num_envs} slot{'' if self.num_envs == 1 else 's'}"]
         if self._closed:
             about.append("closed")
-        elif self._live.all():
-            about.append(f"{int((~self.done).sum())} running, {int(self._success.sum())} successful")
+        elif self._states.live.all():
+            about.append(f"{int((~self.done).sum())} running, {int(self._states.success.sum())} successful")
         else:
             about.append("waiting for reset()")
         labels = list(dict.fromkeys(self._label(int(task)) for task in self._placement.task))
         tasks = ", ".join(labels if len(labels) <= _LISTED else [*labels[:_LISTED], f"... ({len(labels)} in all)"])
         return f"<{type(self).__name__} {self.suite}, tasks {tasks}: {'; '.join(about)}>"
 
-    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
-        raise self._error(
-            f"{type(self).__name__} cannot be pickled or copied: it holds a running simulator. Send a function that "
-            "makes one, such as functools.partial(vecenv.make, suite, tasks=..., episodes=...), and call it in the "
-            "process that uses it; to save the physics use state() and set_state()"
-        )
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise self._error("the environment is closed")
-        if os.getpid() != self._process:
-            raise self._error(
-                f"the environment was made in process {self._process} and this is process {os.getpid()}: its threads "
-                "and renderer do not survive a fork. Call vecenv.make in the process that uses it, or start processes "
-                "with multiprocessing.get_context('spawn')"
-            )
-
     def _check_live(self) -> None:
         self._check_open()
-        if not self._live.all():
+        if not self._states.live.all():
             raise self._error("call reset() first; it starts the placed episodes")

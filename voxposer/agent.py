@@ -32,7 +32,8 @@ from voxposer.following import FOLLOW, Following
 from voxposer.language.llm import Llm
 from voxposer.perception.sight import make_sight
 from voxposer.planned import PlannedMotion
-from voxposer.runtime import RuntimeConfig, Runtimes
+from voxposer.runtime import Runtimes
+from voxposer.runtime_config import RuntimeConfig
 from voxposer.slots import FOLLOWED, Slot
 
 __all__ = ["Agent", "AgentConfig", "PlannedMotion"]

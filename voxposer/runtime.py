@@ -2,106 +2,52 @@
 
 :meth:`Runtimes.init` opens an episode on its first snapshot and returns a handle. :meth:`Runtimes.planner` splits an
 instruction into subtasks, :meth:`Runtimes.plan_subtask` plans one of them on a fresh snapshot: its program asks for
-motions, and the value maps of all slots become paths in one call. Whoever follows the trajectories (``voxposer.agent``,
-or a loop of one's own over ``voxposer.episode``) decides when. All methods take one row for each slot.
+motions, and the value maps of all slots become paths in one call (``voxposer.motions``). Whoever follows the
+trajectories (``voxposer.agent``, or a loop of one's own over ``voxposer.episode``) decides when. All methods take one
+row for each slot.
 
 An object that is to be moved without a grasp is pushed, one push for each call of ``plan_subtask``: the index of the
 next subtask stays where it is until the object has arrived. A slot whose program fails, or for which there is no path,
-is stopped with its cause (``voxposer.slots``); one whose questions the model does not answer is stopped without a
+is stopped with its cause (``voxposer.failures``); one whose questions the model does not answer is stopped without a
 verdict (``Slot.error``). The programs of a call are run side by side, so that slots wait for a model together.
 """
 
 from __future__ import annotations
 
 import json
-import logging
 import secrets
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
-from vecenv.errors import InvalidInput, VecenvError
-from vecenv.manipulation.routes import RouteConfig, Stop
-from vecenv.manipulation.world import matrix
+from vecenv.errors import InvalidInput
 from vecenv.observations import ObjectsSnapshot
 from voxposer import pushing
-from voxposer.episode import MAX_SUBTASKS, MAX_WAYPOINTS, trajectory_of_stops
+from voxposer.episode import trajectory_of_stops
+from voxposer.failures import end_with, stop_with
 from voxposer.interface import Interface
 from voxposer.language.llm import Llm
 from voxposer.language.lmp import build_lmps
-from voxposer.language.lmp_config import CONFIGS, Call, LmpConfig
-from voxposer.language.replies import LlmError
-from voxposer.paths import PlannedOn, each_alone, plan_paths
-from voxposer.perception.config import HandState, PerceptionConfig
+from voxposer.language.lmp_config import Call
+from voxposer.motions import MotionPlanner
+from voxposer.perception.config import HandState
 from voxposer.perception.view import Perception
 from voxposer.planned import PlannedMotion, PlannedSubtasks, Subtasks
-from voxposer.planning.config import PlannerConfig
-from voxposer.planning.plan import PlanConfig
-from voxposer.pushing import PushingConfig, PushSituation
-from voxposer.quaternions import quaternion
-from voxposer.requests import InterfaceError, MotionRequest
-from voxposer.sandbox.guard import HostFault, Limits, shortened
-from voxposer.slots import Grasp, Latest, Moving, Pushing, Ready, Slot, pending
-from voxposer.stops import stops_of, travel
-from voxposer.turns import Turns, TurnsOver
+from voxposer.runtime_config import RuntimeConfig
+from voxposer.slots import Latest, Moving, Pushing, Ready, Slot, pending
+from voxposer.turns import Turns
 
 # Episodes that are open at once.
 MOST_EPISODES = 4096
-# Characters of the cause of a slot that is stopped.
-_CAUSE = 2000
 # A motion has reached its targets within this many voxels, as upstream's ``execute`` has it.
 _REACHED = 2.0
-# Errors of a program, of what it asked for, or of what it looked for: they stop a slot. So does any other, which is
-# logged as well, because this package is then to blame.
-_EXPECTED = (HostFault, VecenvError)
-_log = logging.getLogger(__name__)
 
 
 class HandleError(InvalidInput):
     """A handle of no open episode, or too many open episodes; the message says which."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RuntimeConfig:
-    """Options of planning, and the budgets of the loops around it.
-
-    Attributes:
-        perception: how objects are seen.
-        route: distances that the hand keeps from the scene.
-        plan: how stops become waypoints.
-        planner: of paths over voxels.
-        push: how objects are pushed.
-        limits: what a program may use.
-        lmps: the language programs, by name.
-        repairs: how often the model is shown what a program of its did wrong, and asked for another; 0 for never.
-        max_subtasks: how often a subtask is planned and followed in an episode; None for no limit.
-        max_waypoints: waypoints that are followed of a trajectory; None for no limit.
-        num_waypoints_per_plan: stops that are kept of a planned motion, the first ones.
-        max_plan_iter: how often a motion of the hand is planned, each time on a fresh snapshot, until the hand is
-            within two voxels of its targets. Its maps stay those of the first time.
-    """
-
-    perception: PerceptionConfig = field(default_factory=PerceptionConfig)
-    route: RouteConfig = field(default_factory=RouteConfig)
-    plan: PlanConfig = field(default_factory=PlanConfig)
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
-    push: PushingConfig = field(default_factory=PushingConfig)
-    limits: Limits = field(default_factory=Limits)
-    lmps: Mapping[str, LmpConfig] = field(default_factory=lambda: CONFIGS)
-    repairs: int = 1
-    max_subtasks: int | None = MAX_SUBTASKS
-    max_waypoints: int | None = MAX_WAYPOINTS
-    num_waypoints_per_plan: int = 10_000
-    max_plan_iter: int = 1
-
-    def __post_init__(self) -> None:
-        for name in ("max_subtasks", "max_waypoints", "num_waypoints_per_plan", "max_plan_iter"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InvalidInput(f"{name} must be at least 1, got {value}")
 
 
 class Runtimes:
@@ -119,14 +65,15 @@ class Runtimes:
     def __init__(
         self,
         llm: Llm,
-        config: RuntimeConfig = RuntimeConfig(),
+        config: RuntimeConfig = RuntimeConfig(),  # noqa: B008  (frozen)
         *,
         prompts_dir: str | None = None,
         on_planned: Callable[[PlannedMotion], None] | None = None,
         most: int = MOST_EPISODES,
     ) -> None:
         self.config = config
-        self._llm, self._prompts_dir, self._on_planned, self._most = llm, prompts_dir, on_planned, most
+        self._llm, self._prompts_dir, self._most = llm, prompts_dir, most
+        self._motions = MotionPlanner(config, on_planned)
         self._slots: dict[str, Slot] = {}
         self._turns = Turns(1 if self.rule_based else llm.config.concurrency)
         self._identity = 0
@@ -232,7 +179,7 @@ class Runtimes:
             if not slot.progress.has_next:
                 slot.stop("the planner found nothing to do")
         except Exception as error:
-            _end_with(slot, error)
+            end_with(slot, error)
 
     def _together(self, slots: Sequence[Slot], jobs: Sequence[Callable[[], None]]) -> None:
         """Run a job for each slot, side by side where they wait for a model."""
@@ -272,7 +219,7 @@ class Runtimes:
             if again:
                 self._end_motion(slot)
         except Exception as error:
-            _stop_with(slot, error)
+            stop_with(slot, error)
 
     def _end_motion(self, slot: Slot) -> None:
         """End a motion that may be planned again, if the hand has reached its targets or it was planned enough."""
@@ -329,7 +276,7 @@ class Runtimes:
         wanted = zip(slots, map(tuple, subtask_list), indices, strict=True)
         self._together(slots, [partial(self._run_programs, *each) for each in wanted])
         before = np.array([slot.grip.closed for slot in slots], bool)
-        motions = self._plan(slots)
+        motions = self._motions.plan(slots)
         for slot, own, closed in zip(slots, motions, before, strict=True):
             slot.progress = replace(slot.progress, unfinished=_unfinished(slot))
             if slot.cause and own:
@@ -374,95 +321,7 @@ class Runtimes:
                 if requests:
                     slot.enter(Moving(requests))
         except Exception as error:
-            _end_with(slot, error)
-
-    def _plan(self, slots: Sequence[Slot]) -> list[list[list[Stop]]]:
-        """The motions of every slot that its programs asked for, each a list of stops."""
-        motions: list[list[list[Stop]]] = [[] for _ in slots]
-        for slot in slots:
-            try:
-                _return_hand(slot)
-            except Exception as error:
-                _stop_with(slot, error)
-        waiting = [i for i, slot in enumerate(slots) if isinstance(slot.phase, Moving)]
-        while waiting:
-            wants = [(slots[i].interface, slots[i].requests[0]) for i in waiting]
-            kept: dict[int, PlannedOn] = {}
-            then = [slots[i].requests[1] if len(slots[i].requests) > 1 else None for i in waiting]
-            paths = plan_paths(wants, self.config.planner, self.config.route, kept if self._on_planned else None, then)
-            for row, (i, path) in enumerate(zip(waiting, paths, strict=True)):
-                stops = self._plan_motion(i, slots[i], path, kept.get(row))
-                motions[i] += [stops] if stops else []
-            waiting = [i for i in waiting if isinstance(phase := slots[i].phase, Moving) and not phase.iterations]
-        self._plan_pushes([slot for slot in slots if isinstance(slot.phase, Pushing)], slots, motions)
-        return motions
-
-    def _plan_motion(
-        self, row: int, slot: Slot, path: np.ndarray | InterfaceError, maps: PlannedOn | None
-    ) -> list[Stop]:
-        """Stops of a slot's next motion; the hand is then taken to be at its end."""
-        perception, request, grip = slot.interface.perception, slot.requests[0], slot.grip.closed
-        slot.latest = replace(slot.latest, movable=request.movable, object_centric=request.object_centric)
-        start = np.concatenate([perception.ee.pos, quaternion(perception.ee.rotation)])
-        try:
-            stops = self._begun(slot, path)
-        except Exception as error:
-            _stop_with(slot, error)
-            return []
-        if self._on_planned:
-            number, text = slot.progress.number, slot.progress.text
-            obstacles, value = maps or (None, None)
-            shown = (np.asarray(path), tuple(stops), obstacles, start, grip, slot.latest.calls, value)
-            self._on_planned(PlannedMotion(row, number, text, request, perception, *shown))
-        if stops:
-            perception.move_hand(stops[-1].pos, matrix(stops[-1].quat), closed=slot.grip.closed)
-        return stops
-
-    def _begun(self, slot: Slot, path: np.ndarray | InterfaceError) -> list[Stop]:
-        """Stops of a slot's next motion, which it enters; none where an object is to be pushed."""
-        assert isinstance(slot.phase, Moving)
-        perception, request, rest = slot.interface.perception, slot.requests[0], slot.requests[1:]
-        if isinstance(path, InterfaceError):
-            raise path
-        if request.object_centric:
-            slot.enter(Pushing(pushing.task_of(request.movable, perception.grid.world(path), perception), rest))
-            return []
-        stops = stops_of(request, path, perception, self.config.route, closed=slot.grip.closed)
-        stops = _finite(stops[: self.config.num_waypoints_per_plan])
-        if request.kind == "path":
-            _remember_grasp(slot, request, path[-1])
-        again = request.kind == "path" and self.config.max_plan_iter > 1
-        slot.enter(replace(slot.phase, iterations=slot.phase.iterations + 1) if again else pending(rest))
-        slot.close_grip(stops[-1].closed)
-        return stops
-
-    def _plan_pushes(
-        self, pushing_slots: Sequence[Slot], slots: Sequence[Slot], motions: list[list[list[Stop]]]
-    ) -> None:
-        """The next push of every slot that pushes, searched for all in one call."""
-        found = [(slot, situation) for slot in pushing_slots if (situation := self._situation(slot))]
-        pushes = each_alone(lambda chosen: pushing.next_pushes(chosen, self.config.push), [each for _, each in found])
-        for (slot, _), stops in zip(found, pushes, strict=True):
-            try:
-                if isinstance(stops, Exception):
-                    raise stops
-                perception = slot.interface.perception
-                here = Stop(perception.ee.pos, quaternion(perception.ee.rotation), True)
-                way = _finite([*travel([here, stops[0]], perception, self.config.route), *stops[1:]])
-            except Exception as error:
-                _stop_with(slot, error)
-                continue
-            motions[slots.index(slot)].append(way)
-            slot.close_grip(way[-1].closed)
-
-    def _situation(self, slot: Slot) -> PushSituation | None:
-        """What is known before the next push; None, and the slot stopped, where there is no room for one."""
-        assert isinstance(slot.phase, Pushing)
-        try:
-            return pushing.situation(slot.phase.task, slot.interface.perception, self.config.push)
-        except Exception as error:
-            _stop_with(slot, error)
-            return None
+            end_with(slot, error)
 
 
 def release(slot: Slot) -> None:
@@ -485,44 +344,6 @@ def _unfinished(slot: Slot) -> int | None:
     return slot.progress.cursor - 1 if isinstance(slot.phase, Moving | Pushing) else None
 
 
-def _return_hand(slot: Slot) -> None:
-    """Let planning start at the present pose of the hand, not at the end of what programs asked for."""
-    if slot.requests:
-        ee = slot.interface.perception.snapshot.ee_pose
-        slot.interface.perception.move_hand(ee[:3], matrix(ee[3:]), closed=slot.grip.closed)
-
-
-def _finite(stops: list[Stop]) -> list[Stop]:
-    """Stops, if the hand can be sent to them."""
-    if not all(np.isfinite([*stop.pos, *stop.quat, stop.velocity]).all() for stop in stops):
-        raise InterfaceError("the motion has a pose or a velocity that is not finite")
-    return stops
-
-
-def _stop_with(slot: Slot, error: Exception) -> None:
-    """Stop a slot, and no other, for an error in its program or in planning what that asked for."""
-    if not isinstance(error, _EXPECTED):
-        _log.error("a slot was stopped by an unexpected error", exc_info=error)
-    slot.interface.taken()  # what its programs asked for so far is never planned
-    if slot.cause:
-        return
-    slot.stop(f"{slot.missing} ({_described(error)})" if slot.missing else _described(error))
-
-
-def _end_with(slot: Slot, error: Exception) -> None:
-    """Stop a slot whose program failed; without a verdict if the model was not asked. What ends the run is raised."""
-    if isinstance(error, TurnsOver) or (isinstance(error, LlmError) and error.permanent):
-        raise error
-    if isinstance(error, LlmError):
-        slot.give_up(_described(error))
-    else:
-        _stop_with(slot, error)
-
-
-def _described(error: Exception) -> str:
-    return shortened(f"{type(error).__name__}: {error}", _CAUSE)
-
-
 def _settle(calls: Sequence[Call]) -> None:
     """Let the first of the equal questions of a round be the one that was paid, whichever happened to be asked first.
 
@@ -537,13 +358,3 @@ def _settle(calls: Sequence[Call]) -> None:
         paid = sum(not call.cached for call in same)
         for number, call in enumerate(same):
             call.cached = number >= paid
-
-
-def _remember_grasp(slot: Slot, request: MotionRequest, end: np.ndarray) -> None:
-    """Keep what a path that ends at a voxel [3] closes the hand around, so that the next look can check it."""
-    perception = slot.interface.perception
-    voxel = np.clip(np.round(end), 0, perception.grid.size - 1).astype(int)
-    name = perception.targets.get((int(voxel[0]), int(voxel[1]), int(voxel[2])))
-    if name and request.closed_at_end(voxel) and name in perception.snapshot.poses:
-        offset = perception.position_of(voxel) - perception.snapshot.poses[name][:3]
-        slot.grip = replace(slot.grip, grasp=Grasp(name, offset))

@@ -2,7 +2,7 @@
 
 In: events of a round (a program asked for motions, a path was planned, an object arrived, an error). Out: a
 :class:`Slot` whose phase, progress, grip and counts are each replaced by a new frozen value. Nothing here looks at the
-scene or plans; ``voxposer.runtime`` decides which event happened.
+scene or plans; ``voxposer.runtime`` and ``voxposer.motions`` decide which event happened.
 
 A slot is *ready* until the program of its next subtask asks for motions, then *moving* while some of them are not yet
 planned. A motion of an object makes it *pushing*, one push a round, until the object has arrived; the other motions of

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.node_calls import Caller
+from support.node_calls import BUDGET, SMALL, STAY, SUITE, Caller
 
 import vecenv
 from vecenv.interop.nodes import (
@@ -21,26 +21,6 @@ from vecenv.interop.nodes import (
     snapshot_to_dict,
 )
 from vecenv.interop.nodes.texts import read_chunk, read_ee_pose
-
-SUITE, BUDGET = "libero_object", 400
-SMALL = {"resolution": 32}
-STAY = [0.0] * 6 + [-1.0]
-
-
-@pytest.fixture(scope="module")
-def libero() -> Iterator[EnvLiberoNodeSet]:
-    nodes = EnvLiberoNodeSet((SUITE, "libero_goal"))
-    nodes.initialize(max_steps=BUDGET)
-    yield nodes
-    nodes.shutdown()
-
-
-@pytest.fixture
-def call(libero: EnvLiberoNodeSet) -> Caller:
-    """The tools, with the first episode at its start."""
-    assert libero.panel.set_field("suite", SUITE).error == ""
-    return Caller(libero)
-
 
 # -- episodes ----------------------------------------------------------------------------------------------------------
 

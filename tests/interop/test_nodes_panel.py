@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.node_calls import Caller
+from support.node_calls import BUDGET, SMALL, STAY, SUITE, Caller
 
 import vecenv
 from vecenv.interop.nodes import (
@@ -27,26 +27,6 @@ from vecenv.interop.nodes import worker as worker_module
 from vecenv.interop.nodes.catalog import LiberoCatalog, SimplerCatalog
 from vecenv.interop.nodes.worker import Worker
 from vecenv.libero.env import LiberoEnv
-
-SUITE, BUDGET = "libero_object", 400
-SMALL = {"resolution": 32}
-STAY = [0.0] * 6 + [-1.0]
-
-
-@pytest.fixture(scope="module")
-def libero() -> Iterator[EnvLiberoNodeSet]:
-    nodes = EnvLiberoNodeSet((SUITE, "libero_goal"))
-    nodes.initialize(max_steps=BUDGET)
-    yield nodes
-    nodes.shutdown()
-
-
-@pytest.fixture
-def call(libero: EnvLiberoNodeSet) -> Caller:
-    """The tools, with the first episode at its start."""
-    assert libero.panel.set_field("suite", SUITE).error == ""
-    return Caller(libero)
-
 
 # -- panel -------------------------------------------------------------------------------------------------------------
 

@@ -265,7 +265,7 @@ def test_worker_processes_draw_what_one_process_draws(small: Path) -> None:
         env = make(BRIDGE, task=CARROT, episodes=range(3), assets=small, num_threads=count)
         assert isinstance(env, SimplerEnv)
         env.reset()
-        env._fault[1] = "bad"
+        env._states.fault[1] = "bad"
         before = env.observe_egocentric()
         env.step_continuous(np.tile([0.05, 0, 0, 0, 0, 0, 1.0], (3, 1)))
         # Drawn when read, of the moment of the observation; the arrays stay when others are drawn, and after close.

@@ -1,4 +1,4 @@
-"""Tools of a node set called by their verbs."""
+"""Tools of a node set called by their verbs, and what tests call them with."""
 
 from __future__ import annotations
 
@@ -6,6 +6,13 @@ import json
 from typing import Any
 
 from vecenv.interop.nodes import NodeSet
+
+# The suite of the first episode, and its step budget.
+SUITE, BUDGET = "libero_object", 400
+# Images that are drawn fast.
+SMALL = {"resolution": 32}
+# The action that moves nothing and keeps the gripper open.
+STAY = [0.0] * 6 + [-1.0]
 
 
 class Caller:

@@ -89,7 +89,7 @@ def fails_first(function: Callable[..., Any], error: Exception, chosen: Callable
 
 
 @pytest.mark.parametrize(
-    "place", ["voxposer.runtime.stops_of", "voxposer.paths.plan_mapped", "voxposer.runtime._remember_grasp"]
+    "place", ["voxposer.motions.stops_of", "voxposer.paths.plan_mapped", "voxposer.motions._remember_grasp"]
 )
 @pytest.mark.parametrize("error", [ZeroDivisionError("no room"), AssertionError(), MemoryError(), KeyError("x" * 9999)])
 def test_an_unexpected_error_of_planning_stops_its_own_slot(
@@ -138,9 +138,9 @@ def test_a_push_that_cannot_be_searched_stops_its_own_slot(monkeypatch: pytest.M
 
 def test_a_motion_to_nowhere_stops_its_own_slot(monkeypatch: pytest.MonkeyPatch) -> None:
     agent, env = acting(GOOD, GOOD)
-    from voxposer import runtime
+    from voxposer import motions
 
-    plan = runtime.stops_of
+    plan = motions.stops_of
 
     def astray(request: Any, path: np.ndarray, perception: Any, route: Any, *, closed: bool) -> Any:
         stops = plan(request, path, perception, route, closed=closed)
@@ -148,7 +148,7 @@ def test_a_motion_to_nowhere_stops_its_own_slot(monkeypatch: pytest.MonkeyPatch)
             stops[-1].pos[0] = np.nan
         return stops
 
-    monkeypatch.setattr(runtime, "stops_of", astray)
+    monkeypatch.setattr(motions, "stops_of", astray)
     agent.step()
     assert "not finite" in agent.slots[0].cause
     assert moved(env, 1)

@@ -239,7 +239,7 @@ class LiberoEnv(SlotBatch):
         """
         self._check_live()
         chunk, sanitized = action_space.continuous(actions, self.num_envs)
-        before = self._steps.copy()
+        before = self._states.steps.copy()
         until = self._until_success
         with self._stepping():
             ran = self.physics.run(chunk, ~self.done, self._ticks_left, self._watchers, until_success=until)
@@ -251,7 +251,7 @@ class LiberoEnv(SlotBatch):
 
     @property
     def _ticks_left(self) -> np.ndarray:
-        return self._max_steps - self._steps
+        return self._states.max_steps - self._states.steps
 
     def _failures(self) -> Mapping[int, str]:
         return self.physics.faults
@@ -373,7 +373,7 @@ class LiberoEnv(SlotBatch):
         check_points(points, LiberoError)
         problems = [self._tasks[int(task)].problem for task in self._placement.task]
         return observe.objects(
-            self.physics.groups, self._exact_scene, problems, self._fault, points, self.slot_indices(slots)
+            self.physics.groups, self._exact_scene, problems, self._states.fault, points, self.slot_indices(slots)
         )
 
     def check_success(self) -> np.ndarray:

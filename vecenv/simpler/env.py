@@ -153,7 +153,7 @@ class SimplerEnv(SlotBatch):
 
     def _in_second_half(self, slot: int) -> bool:
         judge = self._judges[slot]
-        return judge is not None and judge.second_half(int(self._steps[slot]) + 1)
+        return judge is not None and judge.second_half(int(self._states.steps[slot]) + 1)
 
     def advance_subtask(self, slots: npt.ArrayLike | None = None) -> None:
         """Begin the second half in slots (bool [B] or indices, all by default) of tasks that have two.
@@ -212,7 +212,7 @@ class SimplerEnv(SlotBatch):
         chunk, sanitized = action_space.continuous(actions, self.num_envs, ACTION_LIMITS)
         chunk[..., 6] = self._native_gripper(chunk[..., 6])
         self._servo.forget(np.full(self.num_envs, chunk.shape[1] > 0))
-        before, reward = self._steps.copy(), np.zeros(self.num_envs)
+        before, reward = self._states.steps.copy(), np.zeros(self.num_envs)
         with self._stepping():
             for tick in range(chunk.shape[1]):
                 if self.done.all():
@@ -240,7 +240,7 @@ class SimplerEnv(SlotBatch):
         judge = self._judges[slot]
         if judge is None or self.slots.faults[slot]:
             return False
-        self._verdicts[slot] = judge.after(self._facts[slot], int(self._steps[slot]) + 1)
+        self._verdicts[slot] = judge.after(self._facts[slot], int(self._states.steps[slot]) + 1)
         return self._verdicts[slot].success
 
     def _failures(self) -> Mapping[int, str]:
@@ -293,7 +293,7 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         facts = self._facts.copy()
         state = np.concatenate([facts["qpos"], facts["qvel"], facts["base"]], axis=1)
-        healthy: list[int] = [slot for slot in self.slot_indices(slots).tolist() if not self._fault[slot]]
+        healthy: list[int] = [slot for slot in self.slot_indices(slots).tolist() if not self._states.fault[slot]]
         images = LazyImages(self._draw, {slot: (self._episodes[slot], facts[slot]) for slot in healthy})
         cameras = [episode.task.camera for episode in self._episodes]
         return SimplerEgocentric(
@@ -332,13 +332,13 @@ class SimplerEnv(SlotBatch):
         self._check_live()
         check_points(points, SimplerError)
         wanted = np.isin(np.arange(self.num_envs), self.slot_indices(slots))
-        rows = zip(wanted, self._episodes, self._facts, self._fault, strict=True)
+        rows = zip(wanted, self._episodes, self._facts, self._states.fault, strict=True)
         return Objects(
             snapshot=tuple(
                 snapshot.take(episode, facts, points) if asked and not fault else None
                 for asked, episode, facts, fault in rows
             ),
-            error=tuple(f"physics failed: {reason}" if reason else "" for reason in self._fault),
+            error=tuple(f"physics failed: {reason}" if reason else "" for reason in self._states.fault),
         )
 
     @property
@@ -375,7 +375,7 @@ class SimplerEnv(SlotBatch):
         for slot, (position, velocity) in enumerate(rows):
             qpos[slot, : len(position)], qvel[slot, : len(velocity)] = position, velocity
         assert len(facts) == self.num_envs
-        return State(qpos=qpos, qvel=qvel, time=self._steps / self.robot.control_hz, nq=nq, nv=nv)
+        return State(qpos=qpos, qvel=qvel, time=self._states.steps / self.robot.control_hz, nq=nq, nv=nv)
 
     def _split(self, slot: int) -> tuple[np.ndarray, np.ndarray]:
         facts, spec = self._facts[slot], self._episodes[slot].spec

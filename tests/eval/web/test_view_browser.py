@@ -108,6 +108,23 @@ def test_the_page_draws_without_a_complaint(browser: Any, runs: list[Path], sche
         keep(tab, f"view-{scheme}.png")
 
 
+def test_a_token_is_asked_for_and_kept_out_of_the_address(browser: Any, runs: list[Path]) -> None:
+    with viewing(runs[0], token="correct horse battery") as client:
+        tab = browser.new_page(viewport=WIDE)
+        tab.goto(f"{client.url}/view")
+        tab.wait_for_selector("#login[open]")
+        for token in ("wrong", "correct horse battery"):
+            tab.fill("#token", token)
+            tab.press("#token", "Enter")
+            if token == "wrong":
+                tab.wait_for_function("() => document.getElementById('login-problem').textContent !== ''")
+        tab.wait_for_selector("body[data-ready]", state="attached")
+        assert not tab.locator("#login").is_visible()
+        assert tab.locator("#episodes tbody tr").count() == 50
+        assert tab.url == f"{client.url}/view"
+        tab.close()
+
+
 def test_failures_come_first_and_lists_have_pages(browser: Any, runs: list[Path]) -> None:
     with opened(browser, runs[:1]) as (tab, _):
         verdicts = tab.locator("#episodes tbody .verdict")

@@ -4,6 +4,7 @@ import { get, post, releaseOnLeave, ServerError, WRITER } from "./api.js";
 import { Cameras } from "./cameras.js";
 import { element } from "./images.js";
 import { controlKeys } from "./keys.js";
+import { loginDialog } from "./login.js";
 import { showPlan } from "./planning.js";
 import { Plots } from "./plots.js";
 import { Setup } from "./setup.js";
@@ -44,6 +45,11 @@ const stream = new Stream({
     return connectedAgain();
   },
   down: disconnected,
+});
+const login = loginDialog(() => {
+  settle("connection");
+  if (!connected) stream.open();
+  else connectedAgain();
 });
 
 // -- sentences --------------------------------------------------------------------------------------------------------
@@ -300,25 +306,6 @@ async function disconnected(seconds) {
   }
   if (was) announce("The connection was lost.");
 }
-
-function login() {
-  if (!by("login").open) by("login").showModal();
-}
-
-by("login-form").addEventListener("submit", async (event) => {
-  event.preventDefault();
-  try {
-    await post("/api/login", { token: by("token").value });
-    by("token").value = "";
-    by("login-problem").textContent = "";
-    by("login").close();
-    settle("connection");
-    if (!connected) stream.open();
-    else await connectedAgain();
-  } catch (error) {
-    by("login-problem").textContent = error.message;
-  }
-});
 
 // -- what the reader does ---------------------------------------------------------------------------------------------
 

@@ -1,7 +1,8 @@
 // The page of runs: how one or two stand, their episodes, one episode in detail, and what is running.
 
-import { get, post, ServerError } from "./api.js";
+import { get, ServerError } from "./api.js";
 import { element } from "./images.js";
+import { loginDialog } from "./login.js";
 import { Detail } from "./view_episode.js";
 import { List } from "./view_list.js";
 import { RunStream } from "./view_stream.js";
@@ -15,13 +16,14 @@ const runs = []; // one or two: { name, info }
 const walls = new Walls(by("walls"), by("running"));
 const detail = new Detail({ complain, pick: (step) => list.pick(step) });
 const list = new List({ choose: (row) => openEpisode(row), complain });
+const login = loginDialog(() => location.reload());
 let pairsAsked = 0;
 
 // -- sentences --------------------------------------------------------------------------------------------------------
 
 function complain(error) {
   if (error instanceof ServerError && error.status === 401) {
-    if (!by("login").open) by("login").showModal();
+    login();
     return;
   }
   by("problem").querySelector("p").textContent = error.message;
@@ -129,15 +131,6 @@ document.addEventListener("keydown", (event) => {
 
 by("help-open").addEventListener("click", () => by("help").showModal());
 by("problem").querySelector("button").addEventListener("click", () => (by("problem").hidden = true));
-by("login-form").addEventListener("submit", async (event) => {
-  event.preventDefault();
-  try {
-    await post("/api/login", { token: by("token").value });
-    location.reload();
-  } catch (error) {
-    by("login-problem").textContent = error.message;
-  }
-});
 
 // -- begin ------------------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,1 @@
+"""Parts of ``examples/ppo.py``: settings, networks, the environment that is trained on, and the files of a run."""
