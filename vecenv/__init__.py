@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vecenv.libero.render.options import RenderConfig
     from vecenv.simpler.config import SimplerConfig
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 __all__ = [
     "ExtraMissing",
     "LiberoConfig",
