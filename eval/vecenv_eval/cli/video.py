@@ -34,8 +34,11 @@ SETTINGS = (
 _ALSO = {"tasks": "--task", "image_size": "--size", "cameras": "--camera"}
 # One task's first episode, unless others are asked for.
 _USUAL = {"tasks": "0", "episodes": "1"}
+_OF_ALL = "of --results: all"
 _SHOWN = {
-    **_USUAL,
+    "suite": f"required; {_OF_ALL}",
+    **{name: f"{value}; {_OF_ALL}" for name, value in _USUAL.items()},
+    "image_size": "256; of --results: as filmed",
     "max_steps": f"{_MAX_STEPS} in LIBERO without --protocol; else the protocol's",
     "cameras": "agentview",
 }
@@ -53,8 +56,8 @@ _OF_RESULTS = ("suite", "tasks", "episodes", "image_size")
 def video_command(
     results: list[Path] | None = typer.Option(
         None,
-        help="Results folder of `vecenv eval --video all`, whose episodes are shown and none is run; repeatable. "
-        "--suite, --tasks and --episodes choose some, --image-size scales.",
+        help="Results folder whose filmed episodes are shown, in place of running a policy; repeatable. --suite, "
+        "--tasks and --episodes choose some, --image-size scales.",
         show_default="none",
     ),
     every: int = typer.Option(1, min=1, help="Show every so many control ticks."),

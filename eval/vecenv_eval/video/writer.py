@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, contextmanager
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -150,7 +150,7 @@ class VideoWriter:
             raise RenderError(f"{self.path}: a WebP has at most {_LARGEST_WEBP} pixels a side, not {size}")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         container = av.open(str(self.path), "w", options=options)
-        stream = container.add_stream(encoder, rate=self._fps, options=self._options)
+        stream = cast("VideoStream", container.add_stream(encoder, rate=self._fps, options=self._options))
         stream.height, stream.width, stream.pix_fmt = frame.shape[0], frame.shape[1], pixels
         stream.codec_context.thread_count = 1
         return container, stream
