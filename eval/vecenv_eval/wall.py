@@ -80,11 +80,25 @@ def write_wall(
         StoreError: there are no results, or they are damaged.
         SpecError: tasks or episodes that cannot be parsed or do not exist.
         ConfigError: none of the episodes has a video, there are too many, or they do not go together.
-        VideoFileError: a video is damaged.
-        RenderError: the file cannot be written so.
+        VideoFileError: a video is damaged; nothing is written.
+        RenderError: the end of the file's name is another, or the video is too large for it.
+        OSError: the file cannot be written.
     """
     film = film or Film()
     shown, without = find_filmed(folders, suites=suites, tasks=tasks, episodes=episodes)
+    # Beside the file, which may be there already and is replaced once the whole is written.
+    partial = out.with_name(f".{out.stem}.partial{out.suffix}")
+    try:
+        frames = _write(shown, partial, film, height)
+        partial.replace(out)
+    finally:
+        partial.unlink(missing_ok=True)
+    solved = sum(each.record.success for each in shown)
+    return Wall(frames=frames, episodes=len(shown), solved=solved, without=without)
+
+
+def _write(shown: Sequence[Filmed], out: Path, film: Film, height: int | None) -> int:
+    """Write the video of some episodes; returns the number of frames."""
     with ExitStack() as stack:
         videos = [stack.enter_context(VideoReader(each.path)) for each in shown]
         control_hz, size = _common(videos, height)
@@ -97,8 +111,7 @@ def write_wall(
             grid = render_grid(images, titles, columns=film.columns, verdicts=verdicts, border=film.border)
             for _ in range(1 + (film.held(control_hz) if all(ended) else 0)):
                 writer.add(grid)
-    solved = sum(each.record.success for each in shown)
-    return Wall(frames=writer.frames, episodes=len(shown), solved=solved, without=without)
+    return writer.frames
 
 
 def find_filmed(

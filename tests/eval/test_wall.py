@@ -154,8 +154,11 @@ def replaced(path: Path) -> None:
 @pytest.mark.parametrize("damage", [cut, replaced])
 def test_a_damaged_video_is_named(folder: Path, tmp_path: Path, damage: Callable[[Path], None]) -> None:
     damage(folder / "videos" / "libero_goal_1_0.mp4")
+    (tmp_path / "w.mp4").write_text("an earlier film")
     done = invoke("--results", folder, "--out", tmp_path / "w.mp4")
     assert done.exit_code == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "w.mp4"]
+    assert (tmp_path / "w.mp4").read_text() == "an earlier film"
     assert done.stderr.startswith("error: libero_goal_1_0.mp4 ")
     assert len(done.stderr.splitlines()) == 1
 
@@ -173,6 +176,8 @@ def test_a_damaged_video_is_named(folder: Path, tmp_path: Path, damage: Callable
         (["--results", "run", "--episodes", "5-6"], "episode 6"),
         (["--results", "run", "--fps", "0"], "fps=0.0: need more than 0"),
         (["--results", "run", "--hold", "inf"], "hold=inf: need at least 0"),
+        (["--results", "run", "--out", "run/config.json/w.mp4"], "no file can be made in "),
+        (["--results", "run", "--out", "a.mp4"], "--out a.mp4 cannot be written: it is a folder"),
         (["--results", "run", "--out", "w.gif"], "--out w.gif: videos are written as .mp4 or .webp"),
     ],
 )
@@ -180,6 +185,7 @@ def test_what_cannot_be_shown_gets_one_line_and_status_2(
     folder: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], says: str
 ) -> None:
     monkeypatch.chdir(folder.parent)
+    (folder.parent / "a.mp4").mkdir()
     if "0-3" in arguments:
         for path in (folder / "videos").iterdir():
             path.unlink()
@@ -188,7 +194,7 @@ def test_what_cannot_be_shown_gets_one_line_and_status_2(
     assert done.exit_code == 2, done.output
     assert says in done.stderr
     assert len(done.stderr.splitlines()) == 1
-    assert not [path for path in folder.parent.iterdir() if path.suffix in (".mp4", ".webp", ".gif")]
+    assert not [path for path in folder.parent.iterdir() if path.suffix in (".mp4", ".webp", ".gif") and path.is_file()]
 
 
 def test_other_sizes_rates_and_too_many_episodes_are_refused(tmp_path: Path) -> None:

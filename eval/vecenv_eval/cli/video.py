@@ -8,6 +8,7 @@ rendered or written, or the policy cannot go on.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -77,11 +78,21 @@ def video_command(
     with user_errors():
         given = some_settings(settings, config, SETTINGS, "video")
         check_suffix(out, "--out")
+        _check_place(out)
         film = Film(every=every, fps=fps, columns=columns, titles=titles, border=border, hold=hold)
         if results:
             _show(results, given, out, film)
         else:
             _run({**_USUAL, **given}, out, film)
+
+
+def _check_place(out: Path) -> None:
+    """Refuse a file that cannot be made, before anything runs."""
+    folder = next(each for each in out.absolute().parents if each.exists())
+    if out.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        fail(
+            f"--out {out} cannot be written: {'it is a folder' if out.is_dir() else f'no file can be made in {folder}'}"
+        )
 
 
 def _run(given: Mapping[str, Any], out: Path, film: Film) -> None:
@@ -116,6 +127,8 @@ def _show(results: Sequence[Path], given: Mapping[str, Any], out: Path, film: Fi
         )
     except StoreError as error:
         fail(" ".join(str(error).split()))
+    except OSError as error:
+        fail(f"--out {out} cannot be written: {error.strerror or error}")
     without = f"; {wall.without} more have no video" if wall.without else ""
     typer.echo(f"{out}: {wall.frames} frames, {wall.solved} of {wall.episodes} episodes solved{without}")
 
