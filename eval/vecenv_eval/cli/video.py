@@ -90,9 +90,8 @@ def _check_place(out: Path) -> None:
     """Refuse a file that cannot be made, before anything runs."""
     folder = next(each for each in out.absolute().parents if each.exists())
     if out.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        fail(
-            f"--out {out} cannot be written: {'it is a folder' if out.is_dir() else f'no file can be made in {folder}'}"
-        )
+        why = "it is a folder" if out.is_dir() else f"no file can be made in {folder}"
+        fail(f"--out {out} cannot be written: {why}")
 
 
 def _run(given: Mapping[str, Any], out: Path, film: Film) -> None:
