@@ -1,4 +1,4 @@
-"""A policy runs some episodes side by side, and what its cameras see is written to one mp4.
+"""A policy runs some episodes side by side, and what its cameras see is written to one video.
 
 In: a config, of which the episodes run at once; or an environment and a policy. Out: the file. LIBERO's images have the
 size and level of detail that are requested; SIMPLER's are as large as its camera's, and its videos run at its robots' 5
@@ -19,22 +19,21 @@ from vecenv_eval.environments import Environments
 from vecenv_eval.episodes import Stream
 from vecenv_eval.policies import Closing, Policy, PolicyUnavailable, error_of
 from vecenv_eval.runner import Evaluation, check_cameras
+from vecenv_eval.video.film import MOST_EPISODES, Film
 from vecenv_eval.video.writer import Recordable, recording
-
-# Most episodes that one video shows.
-MOST_EPISODES = 100
 
 
 class RecordableEnv(BatchEnv, Recordable, Protocol):
     """An environment that a policy can run and ``recording`` can watch."""
 
 
-def record_config(config: EvalConfig, out: Path) -> tuple[int, int, int]:
+def record_config(config: EvalConfig, out: Path, film: Film | None = None) -> tuple[int, int, int]:
     """Run the episodes of a config side by side and record them.
 
     Args:
         config: what runs; one suite. Its cameras are those that the video shows; the policy gets all.
-        out: the mp4.
+        out: the video, .mp4 or .webp.
+        film: how the episodes are shown.
 
     Returns:
         Frames written, episodes solved, and episodes.
@@ -59,7 +58,7 @@ def record_config(config: EvalConfig, out: Path) -> tuple[int, int, int]:
         try:
             env = environments.place(Stream(evaluation.suite.name, planned)).env
             cameras = config.camera_names or ("agentview",)
-            frames = record_rollout(cast("RecordableEnv", env), evaluation.policy, out, cameras)
+            frames = record_rollout(cast("RecordableEnv", env), evaluation.policy, out, cameras, film)
             if errors := [text for slot in range(len(planned)) if (text := error_of(evaluation.policy, slot))]:
                 raise PolicyUnavailable(f"{len(errors)} of {len(planned)} episodes have no verdict: {errors[0]}")
             return frames, int(env.evaluate().success.sum()), len(planned)
@@ -70,23 +69,38 @@ def record_config(config: EvalConfig, out: Path) -> tuple[int, int, int]:
             evaluation.policy.close()
 
 
-def record_rollout(env: RecordableEnv, policy: Policy, out: Path, cameras: Sequence[str]) -> int:
-    """Run a batch from its start to its end and record it, at the robot's control rate.
+def record_rollout(
+    env: RecordableEnv, policy: Policy, out: Path, cameras: Sequence[str], film: Film | None = None
+) -> int:
+    """Run a batch from its start to its end and record it, by default at the robot's control rate.
 
     Args:
         env: an environment as ``vecenv.make`` returns it.
         policy: see ``vecenv_eval.policies``.
-        out: the mp4.
+        out: the video, .mp4 or .webp.
         cameras: shown side by side.
+        film: how the slots are shown.
 
     Returns:
-        The number of frames written: one per control step, and one that shows the end.
+        The number of frames written: by default one per control step, and one that shows the end.
 
     Raises:
         PolicyStuck: the policy takes no steps.
     """
+    film = film or Film()
     policy.reset(env, env.reset())
-    with recording(env, out, cameras=cameras, fps=env.control_hz) as video:
+    look = recording(
+        env,
+        out,
+        cameras=cameras,
+        columns=film.columns,
+        fps=film.rate(env.control_hz),
+        titles=None if film.titles else (),
+        every=film.every,
+        border=film.border,
+        held=film.held(env.control_hz),
+    )
+    with look as video:
         for _ in drive(env, policy):
             pass
     return video.frames

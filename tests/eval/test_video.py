@@ -69,6 +69,13 @@ def test_verdicts_frame_a_slot() -> None:
     assert max(open_) < 50
 
 
+@pytest.mark.parametrize("border", [0, 5])
+def test_the_frame_is_as_wide_as_asked_for(border: int) -> None:
+    grid = render_grid(IMAGES[4:], border=border, verdicts=[False])
+    assert grid.shape == (20 + 2 * border, 30 + 2 * border, 3)
+    np.testing.assert_array_equal(grid[border : border + 20, border : border + 30], IMAGES[4])
+
+
 @pytest.mark.parametrize(
     ("images", "options", "message"),
     [
@@ -78,6 +85,7 @@ def test_verdicts_frame_a_slot() -> None:
         (IMAGES, {"titles": ["one"]}, "1 titles for 5 images"),
         (IMAGES, {"verdicts": [True]}, "1 verdicts for 5 images"),
         (IMAGES, {"columns": 0}, "columns=0"),
+        (IMAGES, {"border": -1}, "border=-1"),
     ],
 )
 def test_what_cannot_be_tiled_is_refused(images: Any, options: dict[str, Any], message: str) -> None:
@@ -102,8 +110,30 @@ def test_a_video_has_its_frames(tmp_path: Path) -> None:
     assert frames[0].shape == (48, 66, 3)
 
 
-def test_videos_are_mp4(tmp_path: Path) -> None:
-    with pytest.raises(RenderError, match=r"written as \.mp4"):
+def test_an_animated_image_has_its_frames_and_loops(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    Image = pytest.importorskip("PIL.Image")
+    path = tmp_path / "new" / "episode.webp"
+    with VideoWriter(path, fps=10) as writer:
+        for shade in (0, 60, 120, 180, 240):
+            writer.add(np.full((47, 65, 3), shade, np.uint8))
+    with Image.open(path) as image:
+        assert (image.n_frames, image.size, image.info["loop"]) == (5, (66, 48), 0)
+        for number in range(5):
+            image.seek(number)
+            assert np.asarray(image.convert("RGB")).mean() == pytest.approx(60 * number, abs=3)
+            assert image.info["duration"] == 100
+
+
+def test_an_animated_image_has_a_largest_size(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    with pytest.raises(RenderError, match=r"at most 16383 pixels a side, not 16384 x 2 pixels"):
+        VideoWriter(tmp_path / "wide.webp").add(np.zeros((2, 16384, 3), np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
+def test_videos_are_mp4_or_webp(tmp_path: Path) -> None:
+    with pytest.raises(RenderError, match=r"written as \.mp4 or \.webp"):
         VideoWriter(tmp_path / "episode.avi")
 
 

@@ -12,11 +12,13 @@ from support.images import needs_gl
 from typer.testing import CliRunner, Result
 from vecenv_eval.cli.video import SETTINGS
 from vecenv_eval.config import EvalConfig, option_name
+from vecenv_eval.video.film import Film
 
 from vecenv.cli import build_app
 from vecenv.contract import BatchEnv, ResetInfo
 
 av = pytest.importorskip("av")
+Image = pytest.importorskip("PIL.Image")
 
 
 def invoke(*arguments: str) -> Result:
@@ -60,6 +62,22 @@ def test_every_episode_has_a_tile_with_the_cameras_asked_for(tmp_path: Path) -> 
 
 
 @needs_gl
+def test_it_shows_every_few_ticks_and_the_end_in_an_animated_image(tmp_path: Path) -> None:
+    path = tmp_path / "v.webp"
+    words = ["--suite", "libero_goal", "--episodes", "2", "--policy", "zero", "--max-steps", "5", "--image-size", "32"]
+    layout = ["--every", "2", "--fps", "10", "--hold", "0.2", "--columns", "1", "--border", "4", "--no-titles"]
+    done = invoke(*words, "--lod", "fast", *layout, "--out", str(path))
+    assert done.exit_code == 0, done.output
+    assert done.stdout == f"{path}: {3 + 1 + 2} frames, 0 of 2 episodes solved\n"
+    with Image.open(path) as image:
+        assert image.size == (32 + 2 * 4, 2 * (32 + 2 * 4))
+        assert image.info["loop"] == 0
+        image.seek(image.n_frames - 1)
+        red, green, _ = np.asarray(image.convert("RGB"))[1:3].mean((0, 1))
+    assert red > green + 50
+
+
+@needs_gl
 def test_a_file_of_settings_gives_what_options_do_not(tmp_path: Path) -> None:
     (tmp_path / "s.yaml").write_text("suite: libero_goal\nepisodes: 2\npolicy: zero\nmax_steps: 9\nimage_size: 16\n")
     words = ["--config", str(tmp_path / "s.yaml"), "--max-steps", "2", "--size", "32", "--task", "3"]
@@ -71,7 +89,7 @@ def test_a_file_of_settings_gives_what_options_do_not(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ([], "--suite is needed"),
+        ([], "--suite or --results is needed"),
         (["--suite", "libero_gaol"], "unknown suite 'libero_gaol': did you mean libero_goal"),
         (["--suite", "libero_goal,libero_10"], "--suite libero_goal,libero_10: a video shows one suite"),
         (["--suite", "libero_goal", "--tasks", "all", "--episodes", "all"], "500 episodes are more than the 100"),
@@ -114,7 +132,7 @@ def test_a_saved_evaluation_can_be_filmed_as_far_as_it_applies(tmp_path: Path, m
     """Settings that a video does not have, and that hold their default, are no obstacle."""
     seen: list[EvalConfig] = []
 
-    def record(config: EvalConfig, out: Path) -> tuple[int, int, int]:
+    def record(config: EvalConfig, out: Path, film: Film) -> tuple[int, int, int]:
         seen.append(config)
         return 1, 0, 1
 

@@ -18,7 +18,7 @@ from vecenv.libero.render.options import RenderError
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
-# Height of a line of a title, and width of the frame around a tile, pixels.
+# Height of a line of a title, and usual width of the frame around a tile, pixels.
 TITLE_HEIGHT, GAP = 16, 2
 # Most lines of a title, where its text starts in a line (x, y), and its size, pixels.
 _MAX_LINES, _TEXT_AT, _TEXT_SIZE = 3, (3, 2), 11
@@ -32,6 +32,7 @@ def render_grid(
     *,
     columns: int | None = None,
     verdicts: Sequence[bool | None] = (),
+    border: int = GAP,
 ) -> np.ndarray:
     """Tile images into one, uint8 [H', W', 3]; a notebook shows it with ``PIL.Image.fromarray``.
 
@@ -40,9 +41,10 @@ def render_grid(
         titles: text above each image, on up to three lines, as many as the longest needs; longer text is cut off.
         columns: images in a row; by default about as many as there are rows.
         verdicts: True frames an image in green, False in red, None not at all; titles begin with the verdict as a word.
+        border: width of the frame around each image, pixels.
 
     Raises:
-        RenderError: these are no images, or the number of titles or verdicts is not the number of images.
+        RenderError: these are no images, the border is below 0, or there are not as many titles or verdicts as images.
     """
     tiles = _side_by_side(images)
     for name, given in (("titles", titles), ("verdicts", verdicts)):
@@ -50,9 +52,12 @@ def render_grid(
             raise RenderError(f"{len(given)} {name} for {len(tiles)} images")
     if columns is not None and columns < 1:
         raise RenderError(f"columns={columns}: need at least 1")
+    if border < 0:
+        raise RenderError(f"border={border}: need at least 0")
     heads = _heads(titles, verdicts, tiles.shape[2])
     framed = [
-        _framed(tile, heads[i] if heads else None, verdicts[i] if verdicts else None) for i, tile in enumerate(tiles)
+        _framed(tile, heads[i] if heads else None, verdicts[i] if verdicts else None, border)
+        for i, tile in enumerate(tiles)
     ]
     columns = min(columns or math.ceil(math.sqrt(len(framed))), len(framed))
     height, width = framed[0].shape[:2]
@@ -75,10 +80,11 @@ def _side_by_side(images: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(sets, axis=2)
 
 
-def _framed(tile: np.ndarray, head: np.ndarray | None, verdict: bool | None) -> np.ndarray:
+def _framed(tile: np.ndarray, head: np.ndarray | None, verdict: bool | None, border: int) -> np.ndarray:
     whole = tile if head is None else np.concatenate([head, tile])
-    framed = np.full((whole.shape[0] + 2 * GAP, whole.shape[1] + 2 * GAP, 3), _VERDICTS[verdict][1], np.uint8)
-    framed[GAP:-GAP, GAP:-GAP] = whole
+    height, width = whole.shape[:2]
+    framed = np.full((height + 2 * border, width + 2 * border, 3), _VERDICTS[verdict][1], np.uint8)
+    framed[border : border + height, border : border + width] = whole
     return framed
 
 

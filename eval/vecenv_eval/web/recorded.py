@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,11 +21,9 @@ from vecenv_eval.config import EvalConfig
 from vecenv_eval.episodes import Episode
 from vecenv_eval.store import ResultStore, log_path
 from vecenv_eval.video.episodes import CAMERAS, video_path
+from vecenv_eval.video.reader import VideoFileError, VideoReader, opened, sentence
 from vecenv_eval.web.rows import UnsafePath, regular_file
 from vecenv_eval.web.runs import Leg
-
-if TYPE_CHECKING:
-    from av.container import InputContainer
 
 # Every camera of a video, as it was written.
 WHOLE = "all"
@@ -35,8 +33,6 @@ ACTION_NAMES = ("x", "y", "z", "rx", "ry", "rz", "gripper")
 # Joints of the robot, which come first in a state: LIBERO's arm and fingers, SIMPLER's robots.
 _JOINTS = {"libero": 9, "simpler/bridge": 8, "simpler/google_robot": 11}
 _KEPT = 8
-# Longest side of a video's images, pixels.
-_LARGEST = 8192
 _Value = TypeVar("_Value")
 
 
@@ -168,36 +164,16 @@ def _cameras_of(leg: Leg) -> tuple[str, ...]:
 
 
 def _video_facts(path: Path, cameras: Sequence[str]) -> VideoFacts:
-    from av.error import FFmpegError
-
     try:
-        with _opened(path) as container:
-            stream = container.streams.video[0]
-            frames, rate = stream.frames, stream.average_rate
-            width, height = stream.width, stream.height
-    except (FFmpegError, IndexError, ValueError, OSError) as error:
-        raise Unreadable(_sentence(path, error)) from None
-    if not (frames and rate and width and height):
-        raise Unreadable(f"{path.name} cannot be played: it holds no frames")
-    if max(width, height) > _LARGEST:
-        raise Unreadable(f"{path.name} cannot be played: its images are {width} x {height} pixels")
+        with VideoReader(path) as video:
+            frames, fps, width, height = video.frames, video.fps, video.width, video.height
+    except VideoFileError as error:
+        raise Unreadable(str(error)) from None
     # Images are square and of one size unless a camera was left out; then nobody knows which is which.
     known = len(cameras) > 1 and width == height * len(cameras)
     return VideoFacts(
-        path=path, frames=frames, fps=float(rate), width=width, height=height, cameras=tuple(cameras) if known else ()
+        path=path, frames=frames, fps=fps, width=width, height=height, cameras=tuple(cameras) if known else ()
     )
-
-
-def _opened(path: Path) -> InputContainer:
-    """A video file, read as an mp4 whatever it claims to be: other formats may name further files."""
-    import av
-
-    return av.open(str(path), format="mp4", options={"protocol_whitelist": "file"})
-
-
-def _sentence(path: Path, error: Exception) -> str:
-    reason = " ".join(str(error).split()).replace(str(path), path.name)
-    return f"{path.name} cannot be played: {reason[:200]}"
 
 
 def video_frame(video: VideoFacts, tick: int, camera: str = WHOLE) -> np.ndarray:
@@ -221,7 +197,7 @@ def _decoded(video: VideoFacts, number: int) -> np.ndarray:
     from av.error import FFmpegError
 
     try:
-        with _opened(video.path) as container:
+        with opened(video.path) as container:
             stream = container.streams.video[0]
             assert stream.time_base is not None
             wanted = round(number / video.fps / stream.time_base)
@@ -234,7 +210,7 @@ def _decoded(video: VideoFacts, number: int) -> np.ndarray:
             if last is not None:
                 return last.to_ndarray(format="rgb24")
     except (FFmpegError, ValueError, OSError) as error:
-        raise Unreadable(_sentence(video.path, error)) from None
+        raise Unreadable(sentence(video.path, error)) from None
     raise Unreadable(f"{video.path.name} has no frame {number}")
 
 
