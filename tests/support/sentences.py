@@ -1,8 +1,8 @@
 """The two sets of sentences in ``tests/data/``, and what the offline writer makes of each sentence.
 
 A sentence is planned and carried out in ``offline_world``; the relations that hold afterwards are compared with those
-that the file expects. The first file's head says what they mean. A fixed rule, the hash of the sentence, puts each sentence
-into the half that the grammar is tuned on or into the one that is only scored.
+that the file expects. The first file's head says what they mean. A fixed rule, the hash of the sentence, puts each
+sentence into the half that the grammar is tuned on or into the one that is only scored.
 """
 
 from __future__ import annotations

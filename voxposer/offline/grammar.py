@@ -17,6 +17,7 @@ from voxposer.offline.lexicon import SIDE_WORDS, SIZES, words
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place, Ranking, Relation
 from voxposer.offline.names import COLOURS, Name, NotUnderstood, matching, read_names
 from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, read_phrase, read_phrases
+from voxposer.offline.spelling import corrected
 from voxposer.offline.tokens import Cursor, tokenize
 
 # Longer texts are no instructions, and cost time.
@@ -45,10 +46,12 @@ def understand(text: str, objects: Sequence[str] = ()) -> Instruction:
     tokens = tokenize(text)
     if len(tokens) > _MOST_WORDS:
         raise NotUnderstood(f"{' '.join(tokens[:8])!r} ...: an instruction has at most {_MOST_WORDS} words")
+    names = read_names(objects)
+    tokens, slips = corrected(tokens, names)
     clauses, speed = read_clauses(tokens)
     if not clauses:
         raise NotUnderstood(f"no known verb at the beginning of {text.strip()[:80]!r}")
-    return _Reader(read_names(objects)).read(clauses, speed)
+    return replace(_Reader(names).read(clauses, speed), slips=slips)
 
 
 def read_noun(text: str) -> Noun:

@@ -250,3 +250,15 @@ FARTHEST = frozenset(["farthest", "furthest", "farther", "further"])
 # Where an order starts, "the second from the left", and where a superlative leads, "the furthest to the right".
 EXCEPTIONS = ("except for", "except", "apart from", "other than", "excluding", "besides", "but not", "but")
 GENERIC = frozenset(words("object item thing everything anything stuff"))
+
+# Every word that a table has: what a typing error can be one of.
+KNOWN: frozenset[str] = frozenset(
+    [
+        *VERBS, *GERUNDS, *PARTICIPLES, *PARTICLES, *STATES, *GOES, *QUESTIONS, *SPEEDS, *ARTICLES, *INDEFINITE, *ALL,
+        *NUMBERS, *ORDINALS, *UNITS, *SIDE_WORDS, *ORDERS, *SIZES, *NEAREST, *FARTHEST, *GENERIC, *BEFORE, *AFTER,
+        *(f"{word}s" for word in GENERIC),
+        *(word for table in (POLITE, FILLERS, THEN, MODALS, PREPOSITIONS) for phrase in table for word in phrase),
+        *(word for phrase in EXCEPTIONS for word in phrase.split()),
+        *words("both it them they which that who whose and or not without while between other others one ones is are"),
+    ]
+)  # fmt: skip

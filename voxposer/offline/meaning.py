@@ -176,6 +176,7 @@ class Instruction:
         untouched: what must not be acted on.
         kept: what must be "open" or "close" in the end, or "on" or "off".
         forbidden: actions that are ruled out.
+        slips: words with typing errors, and what each is taken for.
     """
 
     actions: tuple[Action, ...]
@@ -184,6 +185,7 @@ class Instruction:
     untouched: tuple[Noun, ...] = ()
     kept: tuple[tuple[str, Noun], ...] = ()
     forbidden: tuple[Action, ...] = ()
+    slips: tuple[tuple[str, str], ...] = ()
 
 
 NUMBER_WORDS = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}

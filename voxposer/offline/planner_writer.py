@@ -55,7 +55,8 @@ def write_planner(instruction: str, objects: Sequence[str]) -> str:
         raise NotUnderstood(f"{instruction.strip()[:80]!r} describes objects by one another without an end") from None
     extras = _extras(meant, names)
     said = [Block(tuple(_with(sentence, extras) for sentence in block.sentences), block.thing) for block in blocks]
-    return "\n".join([*_program(said), "# done"])
+    slips = [f"# {written!r} is taken for {word!r}" for written, word in meant.slips]
+    return "\n".join([*slips, *_program(said), "# done"])
 
 
 def _program(blocks: Sequence[Block]) -> list[str]:
