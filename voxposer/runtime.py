@@ -32,7 +32,7 @@ from voxposer.episode import MAX_SUBTASKS, MAX_WAYPOINTS, trajectory_of_stops
 from voxposer.interface import Interface
 from voxposer.language.llm import Llm
 from voxposer.language.lmp import build_lmps
-from voxposer.language.lmp_config import CONFIGS, Call, LmpConfig
+from voxposer.language.lmp_config import CONFIGS, Call, LmpConfig, LmpError
 from voxposer.language.replies import LlmError
 from voxposer.paths import PlannedOn, each_alone, plan_paths
 from voxposer.perception.config import HandState, PerceptionConfig
@@ -228,7 +228,12 @@ class Runtimes:
             return
         try:
             slot.lmps.set_context((*slot.snapshot.names, *slot.snapshot.parts))
-            slot.progress = replace(slot.progress, subtasks=slot.lmps.plan(instruction))
+            if slot.interface.snapshot is None:
+                self._observe(slot, slot.snapshot)  # a planner's program may look before it plans
+            if slot.cause:
+                return
+            subtasks = _planned(slot, instruction)
+            slot.progress = replace(slot.progress, subtasks=subtasks, first=slot.progress.first or subtasks)
             if not slot.progress.has_next:
                 slot.stop("the planner found nothing to do")
         except Exception as error:
@@ -507,6 +512,20 @@ def _stop_with(slot: Slot, error: Exception) -> None:
     if slot.cause:
         return
     slot.stop(f"{slot.missing} ({_described(error)})" if slot.missing else _described(error))
+
+
+def _planned(slot: Slot, instruction: str) -> tuple[str, ...]:
+    """The subtasks of an instruction.
+
+    What it presupposes, "the bowl in the drawer", need not be so any more when it is planned again: where the program
+    raises an error then, or finds nothing to do, the subtasks are those of the first pass.
+    """
+    try:
+        return slot.lmps.plan(instruction) or slot.progress.first
+    except LmpError as error:
+        if error.rule != "raised" or not slot.progress.first:
+            raise
+        return slot.progress.first
 
 
 def _end_with(slot: Slot, error: Exception) -> None:

@@ -190,10 +190,21 @@ class ToyWorld:
                 "hand_offset": lambda: self.voxel(self.ee) - self.voxel(self.ee - self._under()),
                 "normal": lambda: np.array([0.0, 0.0, 1.0]),
                 "axis": lambda: axis,
+                "is_open": lambda: self._is_open(name),
                 "held": lambda: name == self.held,
                 "occupancy_map": lambda: np.zeros((self.size,) * 3),
             }
         )
+
+    def _is_open(self, name: str) -> bool | None:
+        """Whether a part with a joint is open, or switched on."""
+        part = self.snapshot.parts.get(name)
+        if part is None or part.joint is None:
+            return None
+        opened = part.joint.opened
+        if part.kind == "knob":
+            return opened + self.turned.get(name, 0.0) > 0.5 * part.joint.travel
+        return self._drawn("open", f"{_stem(name)}_region")
 
     # -- language ------------------------------------------------------------------------------------------------------
 

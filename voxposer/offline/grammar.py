@@ -13,9 +13,9 @@ from dataclasses import replace
 from voxposer.offline.clause import Clause, Group
 from voxposer.offline.clauses import read_clauses
 from voxposer.offline.grounding import ground, is_table
-from voxposer.offline.lexicon import SIDE_WORDS, SIZES, words
-from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place, Ranking, Relation
-from voxposer.offline.names import COLOURS, Name, NotUnderstood, matching, read_names
+from voxposer.offline.meaning import BESIDE, Action, Avoidance, Condition, Instruction, Noun, Place, Ranking, Relation
+from voxposer.offline.mentions import BEARERS, VERBS_SAID, carrying, described_words, inner_nouns
+from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, read_phrase, read_phrases
 from voxposer.offline.spelling import corrected
 from voxposer.offline.tokens import Cursor, tokenize
@@ -101,6 +101,8 @@ class _Reader:
         self._untouched: list[Noun] = []
         self._kept: list[tuple[str, Noun]] = []
         self._forbidden: list[Action] = []
+        self._condition: Condition | None = None
+        self._picked_if: Condition | None = None
 
     def read(self, clauses: Sequence[Clause], speed: float | None) -> Instruction:
         for clause in clauses:
@@ -121,6 +123,7 @@ class _Reader:
     # -- clauses -------------------------------------------------------------------------------------------------------
 
     def _clause(self, clause: Clause) -> None:
+        self._condition = self._conditioned(clause)
         if clause.forbidden:
             self._forbid(clause)
             return
@@ -138,12 +141,32 @@ class _Reader:
         elif verb == "pick":
             self._leave_picked(clause.when)
             self._fixture = self._moved[-1] if self._moved else self._fixture
-            self._picked = self._described(clause.groups)
+            self._picked, self._picked_if = self._described(clause.groups), self._condition
             self._rule_out(clause, self._picked)
         else:
             self._operate(verb, clause)
-        if verb in _VERBS:
+        if verb in VERBS_SAID:
             self._last = (verb, self._last[1])
+
+    def _conditioned(self, clause: Clause) -> Condition | None:
+        """The condition of a clause; what it is about is what "it" stands for in the clause."""
+        spoken = clause.condition
+        if spoken is None:
+            return None
+        if clause.forbidden or clause.verb in {"avoid", "untouched"} or clause.verb.startswith("keep_"):
+            raise NotUnderstood(f"a condition of what not to do is not understood: {clause.said!r}")
+        thing = spoken.thing
+        if thing.is_pronoun and clause.trails and clause.groups[:1] and clause.groups[0][0] is not None:
+            thing = clause.groups[0][0]
+        thing = self._thing(thing)
+        if not clause.trails and (self._condition is None or self._condition.thing != thing):
+            self._mention(thing)
+            self._fixture = thing
+            self._moved = [thing] if spoken.place is not None else self._moved
+        relation = qualified(Noun(words=("thing",)), [spoken.place]).relation if spoken.place is not None else None
+        if relation is not None:
+            relation = replace(relation, refs=tuple(map(self._thing, relation.refs)), negated=False)
+        return Condition(thing=thing, state=spoken.state, relation=relation, negated=spoken.negated)
 
     def _described(self, groups: Sequence[Group]) -> list[Noun]:
         """Objects with all their phrases as their description."""
@@ -184,7 +207,7 @@ class _Reader:
 
     def _leave_picked(self, when: float) -> None:
         """Objects picked up and not put anywhere stay in the hand."""
-        self._actions += [(when, Action(verb="pick", thing=noun)) for noun in self._picked]
+        self._actions += [(when, Action(verb="pick", thing=noun, condition=self._picked_if)) for noun in self._picked]
         self._picked = []
 
     def _rule_out(self, clause: Clause, things: list[Noun]) -> None:
@@ -199,7 +222,7 @@ class _Reader:
     # -- what is meant -------------------------------------------------------------------------------------------------
 
     def _mention(self, noun: Noun) -> None:
-        for part in _inner(noun):
+        for part in inner_nouns(noun):
             if part not in self._mentions[-1:]:
                 self._mentions.append(part)
 
@@ -286,7 +309,7 @@ class _Reader:
         if noun.words[-1] not in {"one", "ones"}:
             return noun
         own = set(noun.words[:-1])
-        heads = [_described_words(mention, own) for mention in mentions if not is_table(mention)]
+        heads = [described_words(mention, own) for mention in mentions if not is_table(mention)]
         heads += [mention.words[-1:] for mention in mentions if not is_table(mention)]
         for head in dict.fromkeys(heads):
             option = replace(noun, words=(*noun.words[:-1], *head))
@@ -312,7 +335,7 @@ class _Reader:
             things = [thing]
             self._rule_out(clause, things)
             self._fixture = thing
-            self._actions.append((clause.when, Action(verb=verb, thing=things[0])))
+            self._actions.append((clause.when, Action(verb=verb, thing=things[0], condition=self._condition)))
 
     # -- putting -------------------------------------------------------------------------------------------------------
 
@@ -366,6 +389,8 @@ class _Reader:
         if not moving:
             missing = f"{word!r} refers to nothing: " if noun else ""
             raise NotUnderstood(f"{missing}the object to put there is missing")
+        if self._picked and self._picked_if != self._condition:
+            raise NotUnderstood(f"{self._picked[0]} is picked up under a condition, and put somewhere without it")
         self._picked = []
         return list(moving)
 
@@ -410,13 +435,13 @@ class _Reader:
         if noun is not None and noun.words[0] == "each other":
             return noun
         if noun is None or noun.words[0] in {"it", "that", "this"}:
-            if noun is not None and len(inner := _inner(thing)) > 1:
+            if noun is not None and len(inner := inner_nouns(thing)) > 1:
                 return inner[-2]
             before = placed[-1].place if placed else self._last[1] if clause.verb == "again" else None
             if before is not None and phrase is self._phrase:
                 return before.thing
             last = self._moved_last(placed)
-            bearing = {"on", "top_of", "in"} if last is not None and last.words[-1] in _BEARERS else set()
+            bearing = {"on", "top_of", "in"} if last is not None and last.words[-1] in BEARERS else set()
             where = before.relation if before else self._last[1].relation if self._last[1] else ""
             if (
                 noun is not None
@@ -449,8 +474,9 @@ class _Reader:
                 placed[:] = [replace(action, thing=thing) for action, thing in zip(placed, things, strict=True)]
 
     def _add(self, actions: list[Action], verb: str, when: float) -> None:
+        actions = [replace(action, condition=self._condition) for action in actions]
         stack, self._put_on = self._put_on, None
-        if stack is not None and stack.place is not None and [action.thing for action in actions] in _carrying(stack):
+        if stack is not None and stack.place is not None and [action.thing for action in actions] in carrying(stack):
             carry = replace(actions[0], thing=stack.place.thing)
             self._actions = [(at, action) for at, action in self._actions if action is not stack]
             actions = [carry, stack]
@@ -463,37 +489,6 @@ class _Reader:
             self._last = (self._last[0], places[-1])
             self._fixture = places[-1].thing
         self._actions += [(when, action) for action in actions]
-
-
-_VERBS = frozenset(words("put stack push pick open close turn_on turn_off"))
-
-
-# Things that others can stand in or on.
-_BEARERS = frozenset(
-    words("plate bowl tray basket towel cloth book block cube box ramekin mug cup pan frypan caddy cookie")
-)
-
-
-def _described_words(noun: Noun, own: set[str]) -> tuple[str, ...]:
-    """What "one" repeats of an earlier description: all but its side and size, and its colour where another is said."""
-    dropped = {*SIDE_WORDS, *SIZES, *(COLOURS if own & COLOURS else ())}
-    return tuple(word for word in noun.words if word not in dropped) or noun.words[-1:]
-
-
-def _carrying(stack: Action) -> list[list[Noun]]:
-    """The objects of an action that carries a stack: both of them."""
-    assert stack.place is not None
-    return [[stack.place.thing, stack.thing]]
-
-
-def _inner(noun: Noun) -> list[Noun]:
-    """The objects that a description names, the described one last."""
-    refs: list[Noun] = []
-    if noun.relation is not None:
-        refs += noun.relation.refs
-    if noun.ranking is not None and noun.ranking.ref is not None:
-        refs.append(noun.ranking.ref)
-    return [*(part for ref in refs for part in _inner(ref)), noun]
 
 
 __all__ = ["Noun", "Ranking", "Relation", "read_between", "read_instruction", "read_noun", "understand"]

@@ -199,3 +199,26 @@ def _part_of(whole: str, names: Sequence[Name], wanted: Sequence[set[str]]) -> N
     """The first part of a thing with exactly the wanted words, in order of preference."""
     parts = [name for name in names if name.whole == whole and name.is_part]
     return next((part for words in wanted for part in parts if set(part.part_words) == words), None)
+
+
+def with_words(noun: Noun, words: tuple[str, ...], names: Sequence[Name]) -> Noun:
+    """The noun with other words; a name itself stays, so that its own part is found."""
+    whole = [name for name in names if name.text in noun.words]
+    words = tuple(
+        part for word in words for part in ((word.split("_")) if whole and word == whole[0].text else (word,))
+    )
+    return Noun(
+        words=tuple(word for word in words if not word.isdigit()),
+        ranking=noun.ranking,
+        relation=noun.relation,
+        plural=noun.plural,
+        number=noun.number,
+        exact=noun.exact,
+        excluded=tuple(_handle_of(excluded) for excluded in noun.excluded),
+        indefinite=noun.indefinite,
+    )
+
+
+def _handle_of(noun: Noun) -> Noun:
+    words = (*(word for word in noun.words if word not in {"drawer", "door"}), "handle")
+    return Noun(words=words, ranking=noun.ranking, relation=noun.relation)

@@ -93,7 +93,7 @@ _STARTS = frozenset(
     words(
         """then but not without while after before once you please finally next first lastly . avoiding keeping staying
         do never when so i also which who having afterwards later leaving nor stay steer with don't instead if until is
-        are"""
+        are unless otherwise else"""
     )
 ) | {""}
 

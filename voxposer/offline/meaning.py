@@ -139,6 +139,23 @@ class Place:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Condition:
+    """What must be so before anything moves, for an action to be done.
+
+    Attributes:
+        thing: what it is about.
+        state: open, close, on or off; "" where it is about a place.
+        relation: where the thing is.
+        negated: whether it must not be so.
+    """
+
+    thing: Noun
+    state: str = ""
+    relation: Relation | None = None
+    negated: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
 class Action:
     """One action.
 
@@ -148,6 +165,7 @@ class Action:
         place: where to, for put and push.
         way: left, right, front or back, for shift.
         cm: how far, for shift.
+        condition: it is done only where this is so.
     """
 
     verb: str
@@ -155,6 +173,7 @@ class Action:
     place: Place | None = None
     way: str = ""
     cm: float = 0.0
+    condition: Condition | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

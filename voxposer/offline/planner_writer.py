@@ -8,37 +8,39 @@ by comparing positions when the subtask runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from voxposer.offline.grammar import read_noun, understand
-from voxposer.offline.grounding import Found, ground, holder, is_fixture, is_table, refs_of
+from voxposer.offline.grounding import Found, ground, holder, is_fixture, is_table, refs_of, with_words
 from voxposer.offline.lexicon import GENERIC, words
-from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place, Ranking
+from voxposer.offline.looks import RESTS, looked_at, presupposed
+from voxposer.offline.meaning import BESIDE, Action, Avoidance, Condition, Instruction, Noun, Place, Ranking
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
+from voxposer.offline.programs import (
+    AVOID,
+    DOOR,
+    DRAWER,
+    FARTHEST,
+    LEAVE,
+    LIFT,
+    SHUT,
+    SIDES_SAID,
+    Block,
+    back_from,
+    goal_of,
+    lifted,
+    program,
+)
 from voxposer.offline.query_writer import write_query
 from voxposer.offline.references import Moves
 
-# Distances named in subtasks, centimetres: over a target before the last descent; before a target that is entered
-# from a side; after grasping and releasing; the way of a drawer, which stops at its end by itself; a step of a door;
-# room kept from what is to be avoided; the longest distance that fits on a table.
-ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID, FARTHEST = 10, 20, 10, 18, 22, 10, 15, 100
 # Steps that take a door through its range.
 DOOR_STEPS = 6
 # Objects that "to" puts things into, and those it puts things next to: all that are not supports.
 _CONTAINERS = frozenset(words("basket tray drawer microwave caddy compartment bowl bin box mug"))
 _SUPPORTS = frozenset(words("plate stove cabinet shelf rack towel cloth table burner level top ramekin"))
-# More things than this that go to one place are written as a loop, so that the program stays short.
-_LOOP = 3
 # What orders by size, which stays the same while an object is carried.
 _SIZES = frozenset(["large", "small", "tall", "short", "long"])
-
-
-@dataclass(frozen=True)
-class Block:
-    """Sentences that do one thing with one object; ``thing`` is its words in them, "" where they are not repeated."""
-
-    sentences: tuple[str, ...]
-    thing: str = ""
 
 
 def write_planner(instruction: str, objects: Sequence[str]) -> str:
@@ -50,42 +52,82 @@ def write_planner(instruction: str, objects: Sequence[str]) -> str:
     names = read_names(objects)
     try:
         meant = understand(instruction, objects)
-        blocks = _Planner(names).plan(meant)
+        lines = _Cases(names, meant).lines()
     except RecursionError:
         raise NotUnderstood(f"{instruction.strip()[:80]!r} describes objects by one another without an end") from None
-    extras = _extras(meant, names)
-    said = [Block(tuple(_with(sentence, extras) for sentence in block.sentences), block.thing) for block in blocks]
     slips = [f"# {written!r} is taken for {word!r}" for written, word in meant.slips]
-    return "\n".join([*slips, *_program(said), "# done"])
+    return "\n".join([*slips, *lines, "# done"])
 
 
-def _program(blocks: Sequence[Block]) -> list[str]:
-    """A line for each sentence, and a loop where several objects are treated alike."""
-    lines: list[str] = []
-    at = 0
-    while at < len(blocks):
-        alike = [blocks[at]]
-        while (
-            blocks[at].thing
-            and at + len(alike) < len(blocks)
-            and _pattern(blocks[at + len(alike)]) == _pattern(blocks[at])
-        ):
-            alike.append(blocks[at + len(alike)])
-        if len(alike) < _LOOP:
-            alike = alike[:1]
-            lines += [f'composer("{sentence}")' for sentence in blocks[at].sentences]
-        else:
-            lines.append(f"for thing in [{', '.join(repr(block.thing) for block in alike)}]:")
-            lines += [f'    composer(f"{sentence}")' for sentence in _pattern(blocks[at])]
-        at += len(alike)
-    return lines
+class _Cases:
+    """The program with what it looks at first, and its two cases where there is a condition."""
+
+    def __init__(self, names: Sequence[Name], meant: Instruction) -> None:
+        self._names, self._meant = names, meant
+        self._extras = _extras(meant, names)
+
+    def lines(self) -> list[str]:
+        """The lines of the program."""
+        found = [action.condition for action in self._meant.actions if action.condition is not None]
+        if not found:
+            return self._with_rests(self._case(self._meant.actions))
+        condition = replace(found[0], negated=False)
+        if any(replace(other, negated=False) != condition for other in found):
+            raise NotUnderstood("more than one condition at a time is not understood")
+        self._check_first(condition)
+        looked, test = self._test(condition)
+        cases = [
+            self._case([action for action in self._meant.actions if _applies(action, negated)])
+            for negated in (False, True)
+        ]
+        then, otherwise = ([f"    {line}" for line in case] for case in cases)
+        branches = [f"if {test}:", *then, "else:", *otherwise] if otherwise else [f"if {test}:", *then]
+        branches = branches if then else [f"if not ({test}):", *otherwise]
+        return self._with_rests([*looked, *branches])
+
+    def _with_rests(self, lines: list[str]) -> list[str]:
+        return [*(RESTS if any("rests(" in line for line in lines) else []), *lines]
+
+    def _case(self, actions: Sequence[Action]) -> list[str]:
+        """The lines of one case: what it presupposes, then its subtasks."""
+        blocks = _Planner(self._names).plan(replace(self._meant, actions=tuple(actions)))
+        said = [
+            Block(tuple(_with(sentence, self._extras) for sentence in block.sentences), block.thing) for block in blocks
+        ]
+        return [*presupposed(actions, self._names), *program(said)]
+
+    def _test(self, condition: Condition) -> tuple[list[str], str]:
+        """Lines that look, and an expression that is true where the condition holds."""
+        if condition.relation is None:
+            part = "knob" if condition.state in {"on", "off"} else "handle"
+            (name,) = self._single(_Planner(self._names).operated(condition.thing, part), condition)
+            test = f"detect({name!r}).is_open"
+            return [], test if condition.state in {"on", "open"} else f"not {test}"
+        (ref,) = condition.relation.refs
+        looked = looked_at(ref, condition.relation, self._names)
+        thing = ground(condition.thing, self._names)
+        if looked is None or not thing.is_settled:
+            raise NotUnderstood(f"whether {condition.thing} is there, {str(condition.relation)!r}, cannot be told")
+        return [*looked[0], f"name = {thing.names[0].text!r}"], looked[1]
+
+    def _single(self, phrases: Sequence[str], condition: Condition) -> list[str]:
+        known = [name.text for name in self._names for phrase in phrases if phrase == f"the {name.text}"]
+        if len(phrases) != 1 or not known:
+            raise NotUnderstood(f"which is to be {condition.state} in the condition, {str(condition.thing)!r}?")
+        return known
+
+    def _check_first(self, condition: Condition) -> None:
+        """Refuse a condition about what was changed before: the program looks before anything moves."""
+        for action in self._meant.actions:
+            if action.condition is not None:
+                return
+            operated = action.verb in {"open", "close", "turn_on", "turn_off"}
+            if operated == (condition.relation is None):
+                raise NotUnderstood(f"whether {condition.thing} is so once {action.thing} was changed is not known yet")
 
 
-def _pattern(block: Block) -> tuple[str, ...]:
-    if not block.thing:
-        return block.sentences
-    grasp = f"grasp {block.thing}"
-    return tuple(sentence.replace(grasp, "grasp {thing}", 1) for sentence in block.sentences)
+def _applies(action: Action, negated: bool) -> bool:
+    return action.condition is None or action.condition.negated == negated
 
 
 def _extras(meant: Instruction, names: Sequence[Name]) -> str:
@@ -291,13 +333,13 @@ class _Planner:
         write_query(found.text, self._objects)
         return found.text
 
-    def _operated(self, noun: Noun, part: str) -> list[str]:
+    def operated(self, noun: Noun, part: str) -> list[str]:
         """The handles or knobs of what is to be opened, closed or turned."""
         words = (*(word for word in noun.words if word not in {"drawer", "door", part}), part)
         if noun.words == ("drawer",) and noun.ranking is None and noun.plural:
             words = ("handle",)
         try:
-            found = ground(_with_words(noun, words, self._names), self._names)
+            found = ground(with_words(noun, words, self._names), self._names)
         except NotUnderstood as error:
             raise NotUnderstood(f"no {part} to {noun} is known: {error}") from None
         if found.noun.plural and not found.is_settled:
@@ -310,7 +352,7 @@ class _Planner:
         things = self._things(action.thing)
         if len(things) > 1:
             raise NotUnderstood(f"{action.thing} are several things for one hand")
-        return [Block(tuple(_lifted(things[0])))]
+        return [Block(tuple(lifted(things[0])))]
 
     def _put(self, action: Action) -> list[Block]:
         assert action.place is not None
@@ -318,12 +360,12 @@ class _Planner:
         blocks = []
         for thing in self._things(action.thing, place):
             if place.relation == "between":
-                goal = _goal(place, self._between(place))
+                goal = goal_of(place, self._between(place))
             else:
                 where = self._place(place, action.thing)
                 words = self._half(action.place, place.relation, where) + where
-                goal = _goal(place, words, self._arrived_at(place, action.thing, words))
-            blocks.append(Block((*_lifted(thing), *goal), thing))
+                goal = goal_of(place, words, self._arrived_at(place, action.thing, words))
+            blocks.append(Block((*lifted(thing), *goal), thing))
         self._moves.add(ground(action.thing, self._names), place)
         return blocks
 
@@ -384,7 +426,7 @@ class _Planner:
         things, place = self._things(action.thing), self._place(action.place, action.thing)
         if len(things) > 1 or action.place.cm is not None or action.place.relation == "between":
             raise NotUnderstood(f"pushing {action.thing} there is not understood; 'move' is")
-        goal = _SIDES_SAID.get(action.place.relation, "towards")
+        goal = SIDES_SAID.get(action.place.relation, "towards")
         return [Block((f"push {things[0]} {goal} {place}", "back to default pose"))]
 
     def _shift(self, action: Action) -> list[Block]:
@@ -394,26 +436,26 @@ class _Planner:
         if len(things) > 1:
             raise NotUnderstood(f"{action.thing} are several things to move")
         way = {"front": "forward", "back": "backward"}.get(action.way, action.way)
-        there = [f"move {way} by {action.cm:g}cm", f"move down by {LIFT}cm", "open gripper", *_LEAVE]
-        return [Block((*_lifted(things[0]), *there))]
+        there = [f"move {way} by {action.cm:g}cm", f"move down by {LIFT}cm", "open gripper", *LEAVE]
+        return [Block((*lifted(things[0]), *there))]
 
     def _open(self, action: Action) -> list[Block]:
-        return [Block(tuple(self._opened(handle))) for handle in self._operated(action.thing, "handle")]
+        return [Block(tuple(self._opened(handle))) for handle in self.operated(action.thing, "handle")]
 
     def _opened(self, handle: str) -> list[str]:
         pulls = (
             [f"pull {handle} by {DOOR}cm"] * DOOR_STEPS if self._is_door(handle) else [f"pull {handle} by {DRAWER}cm"]
         )
-        return [f"grasp {handle}", *pulls, "open gripper", *_back_from(handle)]
+        return [f"grasp {handle}", *pulls, "open gripper", *back_from(handle)]
 
     def _close(self, action: Action) -> list[Block]:
-        return [Block(tuple(self._closed(handle))) for handle in self._operated(action.thing, "handle")]
+        return [Block(tuple(self._closed(handle))) for handle in self.operated(action.thing, "handle")]
 
     def _closed(self, handle: str) -> list[str]:
         if not self._is_door(handle):
-            return [f"push close {handle} by {SHUT}cm", *_back_from(handle)]
+            return [f"push close {handle} by {SHUT}cm", *back_from(handle)]
         steps = [f"push {handle} by {DOOR}cm"] * (DOOR_STEPS - 1)
-        return [f"push close {handle} by {DOOR}cm", *steps, *_back_from(handle)]
+        return [f"push close {handle} by {DOOR}cm", *steps, *back_from(handle)]
 
     def _is_door(self, handle: str) -> bool:
         """A handle that belongs to no drawer."""
@@ -423,68 +465,12 @@ class _Planner:
 
     def _turn(self, action: Action) -> list[Block]:
         switch = action.verb.removeprefix("turn_")
-        knobs = self._operated(action.thing, "knob")
-        return [Block((f"grasp {knob}", f"turn {switch} {knob}", "open gripper", *_LEAVE)) for knob in knobs]
-
-
-_LEAVE = [f"move up by {LIFT}cm", "back to default pose"]
-_SIDES_SAID = {
-    "near": "next to",
-    "left_of": "to the left of",
-    "right_of": "to the right of",
-    "front_of": "to the front of",
-    "back_of": "to the back of",
-    "between": "between",
-    "center": "at the center of",
-}
-
-
-def _lifted(thing: str) -> list[str]:
-    return [f"grasp {thing}", f"move up by {LIFT}cm", f"grasp {thing} again if nothing is held"]
-
-
-def _goal(place: Place, words: str, arrived: str = "") -> list[str]:
-    """The sentences that bring what is held to a place; ``arrived`` are words for it once the hand is there."""
-    arrived = arrived or words
-    if place.relation in _SIDES_SAID:
-        gap = f"{place.cm:g}cm " if place.cm is not None else ""
-        goal = f"{gap}{_SIDES_SAID[place.relation]}"
-        return [f"move to {ABOVE}cm above the table {goal} {words}", f"place it {goal} {arrived}", *_LEAVE]
-    word = "in" if place.relation == "in" else "on"
-    if words.endswith(("_inside", "_level")):
-        return [f"move to {BEFORE}cm in front of {words}", f"place it {word} {words}", *_back_from(words, BEFORE)]
-    return [f"move to {ABOVE}cm above {words}", f"place it {word} {arrived}", *_LEAVE]
-
-
-def _back_from(handle: str, cm: int = ABOVE) -> list[str]:
-    return [f"move back from {handle} by {cm}cm", "back to default pose"]
+        knobs = self.operated(action.thing, "knob")
+        return [Block((f"grasp {knob}", f"turn {switch} {knob}", "open gripper", *LEAVE)) for knob in knobs]
 
 
 def _holding(relation: str) -> str:
     return "on" if relation in {"to", "towards", "center"} else relation
-
-
-def _with_words(noun: Noun, words: tuple[str, ...], names: Sequence[Name]) -> Noun:
-    """The noun with other words; a name itself stays, so that its own part is found."""
-    whole = [name for name in names if name.text in noun.words]
-    words = tuple(
-        part for word in words for part in ((word.split("_")) if whole and word == whole[0].text else (word,))
-    )
-    return Noun(
-        words=tuple(word for word in words if not word.isdigit()),
-        ranking=noun.ranking,
-        relation=noun.relation,
-        plural=noun.plural,
-        number=noun.number,
-        exact=noun.exact,
-        excluded=tuple(_handle_of(excluded) for excluded in noun.excluded),
-        indefinite=noun.indefinite,
-    )
-
-
-def _handle_of(noun: Noun) -> Noun:
-    words = (*(word for word in noun.words if word not in {"drawer", "door"}), "handle")
-    return Noun(words=words, ranking=noun.ranking, relation=noun.relation)
 
 
 def _place_thing(place: Place, names: Sequence[Name]) -> Found:

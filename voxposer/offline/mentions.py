@@ -1,0 +1,36 @@
+"""What was said of objects before, and what "one", "it" and "them" can repeat of it."""
+
+from __future__ import annotations
+
+from voxposer.offline.lexicon import SIDE_WORDS, SIZES, words
+from voxposer.offline.meaning import Action, Noun
+from voxposer.offline.names import COLOURS
+
+# Actions that a clause without a verb can repeat.
+VERBS_SAID = frozenset(words("put stack push pick open close turn_on turn_off"))
+# Things that others can stand in or on.
+BEARERS = frozenset(
+    words("plate bowl tray basket towel cloth book block cube box ramekin mug cup pan frypan caddy cookie")
+)
+
+
+def described_words(noun: Noun, own: set[str]) -> tuple[str, ...]:
+    """What "one" repeats of an earlier description: all but its side and size, and its colour where another is said."""
+    dropped = {*SIDE_WORDS, *SIZES, *(COLOURS if own & COLOURS else ())}
+    return tuple(word for word in noun.words if word not in dropped) or noun.words[-1:]
+
+
+def carrying(stack: Action) -> list[list[Noun]]:
+    """The objects of an action that carries a stack: both of them."""
+    assert stack.place is not None
+    return [[stack.place.thing, stack.thing]]
+
+
+def inner_nouns(noun: Noun) -> list[Noun]:
+    """The objects that a description names, the described one last."""
+    refs: list[Noun] = []
+    if noun.relation is not None:
+        refs += noun.relation.refs
+    if noun.ranking is not None and noun.ranking.ref is not None:
+        refs.append(noun.ranking.ref)
+    return [*(part for ref in refs for part in inner_nouns(ref)), noun]
