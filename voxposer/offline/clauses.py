@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from voxposer.offline.clause import Clause, Spoken
 from voxposer.offline.conditions import OTHERWISE, read_condition
+from voxposer.offline.corrections import corrected_speech, without_indifference
 from voxposer.offline.lexicon import AFTER, BEFORE, EXCEPTIONS, FILLERS, GERUNDS, POLITE, SPEEDS, THEN, VERBS
 from voxposer.offline.limits import constraint, forbidden, question
 from voxposer.offline.names import NotUnderstood
@@ -27,8 +28,9 @@ def read_clauses(tokens: Sequence[str]) -> tuple[list[Clause], float | None]:
     Raises:
         NotUnderstood: words that are part of no clause; the message quotes them.
     """
-    words, speed = _without_manner(list(tokens))
-    return _Sentence(Cursor(words)).read(), speed
+    said, indifferent = without_indifference(tokens)
+    words, speed = _without_manner(corrected_speech(said))
+    return _Sentence(Cursor(words, indifferent=indifferent)).read(), speed
 
 
 def _without_manner(tokens: list[str]) -> tuple[list[str], float | None]:

@@ -14,7 +14,7 @@ from voxposer.offline.clause import Clause, Group
 from voxposer.offline.clauses import read_clauses
 from voxposer.offline.grounding import ground, is_table
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Condition, Instruction, Noun, Place, Ranking, Relation
-from voxposer.offline.mentions import BEARERS, VERBS_SAID, carrying, described_words, inner_nouns
+from voxposer.offline.mentions import BEARERS, VERBS_SAID, carrying, described_words, inner_nouns, is_hollow
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, read_phrase, read_phrases
 from voxposer.offline.spelling import corrected
@@ -138,6 +138,8 @@ class _Reader:
             self._kept += [(verb.removeprefix("keep_"), noun) for noun in self._described(clause.groups)]
         elif verb in {"put", "stack", "push"}:
             self._put(verb, clause)
+        elif verb == "pick" and self._picked and [noun and noun.is_pronoun for noun, _ in clause.groups] == [True]:
+            return  # "hold on to it" adds nothing to what was picked up
         elif verb == "pick":
             self._leave_picked(clause.when)
             self._fixture = self._moved[-1] if self._moved else self._fixture
@@ -349,8 +351,16 @@ class _Reader:
             for thing in self._moving(noun, describing):
                 self._mention(thing)
                 placed.append(self._action(verb, thing, place, clause, placed))
+        placed = self._together(placed)
         self._check_ruled_out(clause, placed)
         self._add(placed, verb, clause.when)
+
+    def _together(self, placed: list[Action]) -> list[Action]:
+        """ "The ramekin and the cookies next to each other": the first goes to the second."""
+        places = [action.place for action in placed if action.place and action.place.thing.words == ("each other",)]
+        if len(placed) != 2 or len(places) != 2 or places[0].relation not in BESIDE:
+            return placed
+        return [replace(placed[0], place=replace(places[0], thing=placed[1].thing))]
 
     def _split(
         self, noun: Noun | None, phrases: Sequence[Phrase], later: Sequence[Group], clause: Clause
@@ -448,12 +458,16 @@ class _Reader:
                 and where in bearing
                 and phrase.kind in bearing - ({"top_of"} if where == "in" else set())
             ):
+                if phrase.kind == "in" and last is not None and is_hollow(last) and where != "in":
+                    return last
                 raise NotUnderstood(f"'{phrase.said} {noun.words[0]}' could be {last} or what it is put on or in")
             if before is not None:
                 return before.thing
             if self._fixture is None and self._mentions[:-1] and noun is not None:
                 return self._mentions[-2]
-        return self._thing(noun if noun is not None else None)
+        if noun is None and self._fixture is None:
+            raise NotUnderstood(f"{phrase.said!r} what? The place for {thing} refers to nothing said before")
+        return self._thing(noun)
 
     def _moved_last(self, placed: Sequence[Action]) -> Noun | None:
         return placed[-1].thing if placed else self._moved[-1] if self._moved else None

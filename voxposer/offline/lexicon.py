@@ -31,6 +31,8 @@ _VERBS: Mapping[str, str] = {
     "open": "open",
     "close": "close shut",
     "turn": "turn switch",
+    "turn_on": "light ignite activate",
+    "turn_off": "extinguish deactivate",
     "pull": "pull",
     "leave": "leave",
     "keep": "keep",
@@ -93,6 +95,8 @@ STATES: Mapping[str, str] = {
     "closed": "close",
     "shut": "close",
 }
+# Which of several drawers or doors, by its state.
+OPENED: Mapping[str, str] = {"open": "open", "opened": "open", "closed": "closed", "shut": "closed"}
 
 # -- around a sentence -------------------------------------------------------------------------------------------------
 
@@ -113,7 +117,8 @@ FILLERS = phrases(
     """please|kindly|thank you|thanks|for me|again|instead|too|as well|right now|now|right away
     immediately|at once|one after the other|one after another|one by one|one at a time|together|neatly|properly|directly
     if you can|if possible|if you please|will you|would you|could you|can you|this time|completely|fully|all the way
-    afterwards|just|simply|straight|right there|safely|of course
+    afterwards|just|simply|straight|right there|safely|of course|thank you very much|thanks a lot|many thanks
+    thank you so much|if you do not mind|if that is ok|if it is possible
     on your own|at the end|while doing so|while doing this|while doing that|in the process|meanwhile|if you would
     if you could"""
 )
@@ -123,7 +128,8 @@ THEN = phrases(
     and next|finally|and finally|lastly|and lastly|last|first|firstly|first of all|second|secondly|thirdly|third
     subsequently|later|and later|to begin with|to start with|once that is done|once done|when that is done
     when you are done|when done|once you are done|in the end|at last|followed by|and also|but|but first|and
-    while you are at it|at the same time"""
+    while you are at it|at the same time|while you|before anything else|before all else|above all|last of all
+    and last of all"""
 )
 BEFORE = ("before", "prior to")
 AFTER = ("after", "once", "as soon as", "when", "having", "after having")
@@ -137,6 +143,17 @@ GOES = frozenset(
 )
 QUESTIONS = frozenset(
     words("is are was were do does did what where which who why how when whose has have am isn't aren't")
+)
+# Said behind alternatives: any of them will do.
+INDIFFERENT = phrases(
+    """i do not care|i do not mind|it does not matter|does not matter|whichever you like|whichever you prefer
+    whichever you want|whichever one you like|as you like|either is fine|either one is fine|any is fine|both are fine
+    up to you|your choice|you choose"""
+)
+# Said where a speaker corrects what was said just before.
+CORRECTIONS = phrases(
+    """sorry|no sorry|oh sorry|no wait|wait no|wait|i mean|no i mean|i meant|no i meant|or rather|make that|no make that
+    correction|no|oh no|actually|no actually|actually no|or actually|scratch that|forget that"""
 )
 NEGATIONS = (
     "do not",

@@ -12,20 +12,21 @@ from collections.abc import Iterator, Sequence
 from voxposer.offline.grounding import Found, ground, is_table, refs_of
 from voxposer.offline.meaning import Action, Noun, Relation
 from voxposer.offline.names import Name, NotUnderstood
-from voxposer.offline.query_writer import SCALE, SIDES_OF, Locator
+from voxposer.offline.query_writer import SCALE, SIDES_OF, Locator, is_on
 
-# Centimetres that the underside of a thing may be off the bounds of what it stands on or in.
-_OFF = 4
+# Centimetres that the underside of a thing may be off the bounds of what it stands on, or is in: drawers are one above
+# the other.
+_OFF_ON, _OFF_IN = 4, 1.5
 _RESTING = frozenset(["on", "in", "top_of", "from"])
 RESTS = [
     SCALE,
-    "def rests(name, support):",
+    "def rests(name, support, off):",
     "    low, high = support.aabb",
     "    bounds = detect(name).aabb",
     "    foot = (bounds[0] + bounds[1]) / 2",
     "    foot[2] = bounds[0][2]",
     "    gap = np.maximum(np.maximum(low - foot, foot - high), 0)",
-    f"    return np.linalg.norm(gap * cm) < {_OFF}",
+    "    return np.linalg.norm(gap * cm) < off",
 ]
 
 
@@ -100,4 +101,4 @@ def looked_at(ref: Noun, relation: Relation, names: Sequence[Name]) -> tuple[lis
     if relation.kind in SIDES_OF:
         sign, axis = SIDES_OF[relation.kind]
         return lines, f"detect(name).position[{axis}] {sign} other.position[{axis}]"
-    return lines, "rests(name, other)"
+    return lines, f"rests(name, other, {_OFF_ON if is_on(relation) else _OFF_IN})"

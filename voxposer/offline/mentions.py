@@ -12,6 +12,12 @@ VERBS_SAID = frozenset(words("put stack push pick open close turn_on turn_off"))
 BEARERS = frozenset(
     words("plate bowl tray basket towel cloth book block cube box ramekin mug cup pan frypan caddy cookie")
 )
+_HOLLOW = frozenset(words("bowl basket tray box ramekin mug cup pan frypan caddy"))
+
+
+def is_hollow(noun: Noun) -> bool:
+    """Whether things go into it, rather than on it."""
+    return noun.words[-1] in _HOLLOW
 
 
 def described_words(noun: Noun, own: set[str]) -> tuple[str, ...]:

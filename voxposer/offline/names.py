@@ -57,7 +57,7 @@ _SENSES = {
     "bbq": ("barbecue", "bottle", "food"),
     "dressing": ("bottle", "food"),
     "milk": ("carton", "drink", "food"),
-    "juice": ("carton", "drink", "food"),
+    "juice": ("carton", "drink", "food", "oj"),
     "cheese": ("box", "food"),
     "butter": ("box", "food"),
     "pudding": ("box", "dessert", "food"),

@@ -16,6 +16,7 @@ from voxposer.offline.lexicon import GENERIC, words
 from voxposer.offline.looks import RESTS, looked_at, presupposed
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Condition, Instruction, Noun, Place, Ranking
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
+from voxposer.offline.opened import with_open_drawer
 from voxposer.offline.programs import (
     AVOID,
     DOOR,
@@ -51,8 +52,9 @@ def write_planner(instruction: str, objects: Sequence[str]) -> str:
     """
     names = read_names(objects)
     try:
-        meant = understand(instruction, objects)
+        meant, drawer = with_open_drawer(understand(instruction, objects), names)
         lines = _Cases(names, meant).lines()
+        lines = drawer.lines(lines) if drawer is not None else lines
     except RecursionError:
         raise NotUnderstood(f"{instruction.strip()[:80]!r} describes objects by one another without an end") from None
     slips = [f"# {written!r} is taken for {word!r}" for written, word in meant.slips]
@@ -94,7 +96,31 @@ class _Cases:
         said = [
             Block(tuple(_with(sentence, self._extras) for sentence in block.sentences), block.thing) for block in blocks
         ]
-        return [*presupposed(actions, self._names), *program(said)]
+        return [*presupposed(actions, self._names), *self._open_already(actions), *program(said)]
+
+    def _open_already(self, actions: Sequence[Action]) -> list[str]:
+        """Lines that check that what must not be opened, and something is to be put in, is open."""
+        into = [
+            name.whole if not name.is_part else name.text.rpartition("_")[0]
+            for action in actions
+            if action.place is not None and action.place.relation == "in" and not is_table(action.place.thing)
+            for name in ground(action.place.thing, self._names).names
+        ]
+        handles = [
+            handle.removeprefix("the ")
+            for action in self._meant.forbidden
+            if action.verb == "open"
+            for handle in _Planner(self._names).operated(action.thing, "handle")
+        ]
+        return [
+            line
+            for handle in handles
+            if handle.removesuffix("_handle") in into
+            for line in (
+                f"if not detect({handle!r}).is_open:",
+                f"    raise ValueError('{handle.removesuffix('_handle')} is closed, and must not be opened')",
+            )
+        ]
 
     def _test(self, condition: Condition) -> tuple[list[str], str]:
         """Lines that look, and an expression that is true where the condition holds."""

@@ -189,7 +189,7 @@ class Locator:
             lines += [*self._scale(), *_from_line(several, *ends)]
             return lines, f"{several}[np.{'argmax' if away else 'argmin'}(distances)]"
         lines, goal = self._goal(relation)
-        if _is_on(relation):
+        if is_on(relation):
             lines += [*self._scale(), *_gaps(several, goal.removesuffix(".position"))]
         else:
             lines += [*self._scale(), _distances(several, goal, flat=relation.kind in _FLAT)]
@@ -248,7 +248,7 @@ def _at(values: str, least: bool, rank: int) -> str:
     return f"np.argsort({values})[{place}]"
 
 
-def _is_on(relation: Relation) -> bool:
+def is_on(relation: Relation) -> bool:
     """Whether the phrase says that an object stands on another; "from" a container means that it was in it."""
     inside = relation.kind == "from" and bool(_CONTAINERS.intersection(relation.refs[0].words))
     return relation.kind in {"on", "top_of", "from"} and not inside

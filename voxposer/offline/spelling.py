@@ -41,6 +41,7 @@ def _meant(token: str, known: Collection[str]) -> str:
     if len(token) < _SHORTEST - 1 or _dictionary().known([token]):
         return ""
     near = {word for word in _dictionary().edit_distance_1(token) if word in known and _is_slip(token, word)}
+    near = {word for word in near if not (word.endswith("s") and word[:-1] in near)}
     return near.pop() if len(near) == 1 else ""
 
 

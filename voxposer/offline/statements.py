@@ -9,8 +9,8 @@ from voxposer.offline.groups import read_groups
 from voxposer.offline.lexicon import GOES, MODALS, PARTICIPLES, STATES, VERBS
 from voxposer.offline.limits import AS_IT_IS
 from voxposer.offline.names import NotUnderstood
-from voxposer.offline.nouns import read_phrases
-from voxposer.offline.orders import at_clause_end, meant, read_shift, take_state
+from voxposer.offline.nouns import qualified, read_phrases
+from voxposer.offline.orders import at_clause_end, imperative, meant, read_shift, take_state
 from voxposer.offline.tokens import Cursor
 
 
@@ -42,6 +42,8 @@ def statement(past: bool) -> Callable[[Cursor], Clause | None]:
         groups = read_groups(cursor, subject=True)
         if not groups or groups[0][0] is None:
             return None
+        if cursor.peek() == "," and cursor.peek(1) in VERBS:
+            return _named_first(cursor, groups)
         ordered = bool(_modals(cursor)) or cursor.tokens[max(start - 1, 0)] in _ASSURED
         linked = cursor.take_any(_LINKS) != ""
         while cursor.take_any(_LINKS):
@@ -59,6 +61,21 @@ def statement(past: bool) -> Callable[[Cursor], Clause | None]:
         return predicate(cursor, groups)
 
     return read
+
+
+def _named_first(cursor: Cursor, groups: list[Group]) -> Clause | None:
+    """ "The milk, put it in the basket": the pronoun is the object that was named first."""
+    cursor.next()
+    clause = imperative(False)(cursor)
+    if clause is None or not clause.groups:
+        return None
+    pronoun, phrases = clause.groups[0]
+    if pronoun is None or pronoun.words not in {("it",), ("them",), ("they",)} or not pronoun.is_pronoun:
+        return None
+    things: list[Group] = [(noun and qualified(noun, described), []) for noun, described in groups]
+    things[-1] = (things[-1][0], phrases)
+    clause.groups[:1] = things
+    return clause
 
 
 _LINKS = frozenset(["has", "have", "is", "are", "gets", "get", "was", "were", "been", "being"])

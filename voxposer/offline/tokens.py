@@ -59,10 +59,11 @@ class Cursor:
 
     Attributes:
         at: index of the next token.
+        indifferent: whether it was said that of alternatives ("or") any will do.
     """
 
-    def __init__(self, tokens: Iterable[str]) -> None:
-        self.tokens, self.at = list(tokens), 0
+    def __init__(self, tokens: Iterable[str], *, indifferent: bool = False) -> None:
+        self.tokens, self.at, self.indifferent = list(tokens), 0, indifferent
 
     @property
     def at_end(self) -> bool:
