@@ -75,6 +75,14 @@ def read_noun(text: str) -> Noun:
     return noun
 
 
+def _stacked(placed: list[Action]) -> list[Action]:
+    """ "Stack the bowl and the cup on the plate": each on the one before."""
+    if len(placed) < 2 or any(action.thing.plural or action.place != placed[0].place for action in placed):
+        return placed
+    supports = [placed[0].place, *(Place(relation="on", thing=action.thing) for action in placed)]
+    return [replace(action, place=support) for action, support in zip(placed, supports, strict=False)]
+
+
 def read_between(text: str) -> tuple[Noun, Noun]:
     """The two objects of "X and Y"."""
     phrase = read_phrase(Cursor(["between", *tokenize(text)]))
@@ -351,7 +359,7 @@ class _Reader:
             for thing in self._moving(noun, describing):
                 self._mention(thing)
                 placed.append(self._action(verb, thing, place, clause, placed))
-        placed = self._together(placed)
+        placed = _stacked(placed) if verb == "stack" else self._together(placed)
         self._check_ruled_out(clause, placed)
         self._add(placed, verb, clause.when)
 
@@ -410,8 +418,8 @@ class _Reader:
                 raise NotUnderstood(f"how far to the {clause.way} is {thing} to go?")
             return Action(verb="shift", thing=thing, way=clause.way, cm=clause.cm)
         place = self._place(phrase, thing, placed, clause)
-        if place is None and verb == "stack" and thing.plural:
-            return Action(verb="stack", thing=thing)
+        if verb == "stack" and thing.plural:
+            return Action(verb="stack", thing=thing, place=place)
         if place is None:
             raise NotUnderstood(f"the destination of {thing} is missing")
         return Action(verb="push" if verb == "push" else "put", thing=thing, place=place)

@@ -20,13 +20,9 @@ _OFF_ON, _OFF_IN = 4, 1.5
 _RESTING = frozenset(["on", "in", "top_of", "from"])
 RESTS = [
     SCALE,
-    "def rests(name, support, off):",
-    "    low, high = support.aabb",
-    "    bounds = detect(name).aabb",
-    "    foot = (bounds[0] + bounds[1]) / 2",
-    "    foot[2] = bounds[0][2]",
-    "    gap = np.maximum(np.maximum(low - foot, foot - high), 0)",
-    "    return np.linalg.norm(gap * cm) < off",
+    "foot = lambda it: (it.aabb[0] + it.aabb[1] * np.array([1, 1, 0])) / np.array([2, 2, 1])",
+    "off = lambda foot, low, high: np.linalg.norm(np.maximum(np.maximum(low - foot, foot - high), 0) * cm)",
+    "rests = lambda name, at, most: off(foot(detect(name)), at.aabb[0], at.aabb[1]) < most",
 ]
 
 
@@ -88,7 +84,7 @@ def _premise(found: Found, noun: Noun, relation: Relation, names: Sequence[Name]
     count = f"len([name for name in [{listed}] if {'not ' if relation.negated else ''}{test}])"
     least = several if noun.plural or noun.indefinite or not relation.negated else 1
     wrong = f"{count} != 1" if relation.negated and not (noun.plural or noun.indefinite) else f"{count} < {least}"
-    return "\n".join([*lines, f"if {wrong}:", f"    raise ValueError({f'there is no such object: {noun}'!r})"])
+    return "\n".join([*lines, f"if {wrong}: raise ValueError({f'there is no such object: {noun}'!r})"])
 
 
 def looked_at(ref: Noun, relation: Relation, names: Sequence[Name]) -> tuple[list[str], str] | None:

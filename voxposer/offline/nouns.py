@@ -20,6 +20,7 @@ from voxposer.offline.lexicon import (
     OPENED,
     ORDERS,
     ORDINALS,
+    PARTICIPLES,
     PREPOSITIONS,
     SIDE_WORDS,
     STATES,
@@ -256,6 +257,7 @@ def _ends_words(cursor: Cursor, last: str) -> bool:
         or (token in {"can", "will", "may", "might", "could"} and after in {"be", "go", "not"})
         or (token == "back" and after in _BEFORE_PLACES)
         or (token == "side" and after == "by")
+        or (token in PARTICIPLES and token not in SIDE_WORDS and after in _BEFORE_PLACES - {"", ",", "."})
         or (token in ORDINALS and after in {"", ",", ".", "and", "then"})
         or token in GERUNDS
         or _is_verb(cursor)

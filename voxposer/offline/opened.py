@@ -32,10 +32,9 @@ class OpenDrawer:
         listed = ", ".join(map(repr, self.stems))
         negated = "" if self.state == "open" else "not "
         look = [
-            f"{self.state} = [name for name in [{listed}] if {negated}detect(name + '_handle').is_open]",
-            f"if len({self.state}) != 1:",
-            f"    raise ValueError(f'which drawer? Of {len(self.stems)}, {{len({self.state})}} are {self.state}')",
-            f"drawer = {self.state}[0]",
+            f"drawers = [name for name in [{listed}] if {negated}detect(name + '_handle').is_open]",
+            f"if len(drawers) != 1: raise ValueError('which drawer? Not just one of them is {self.state}')",
+            "drawer = drawers[0]",
         ]
         return [*look, *(self._line(line) for line in lines)]
 
@@ -43,7 +42,7 @@ class OpenDrawer:
         part = rf"{re.escape(self.stems[0])}_(drawer|handle)"
         line = re.sub(rf"detect\('{part}'\)", r"detect(drawer + '_\1')", line)
         changed = re.sub(part, r"{drawer}_\1", line)
-        return changed if changed == line else changed.replace('composer("', 'composer(f"')
+        return line if changed == line else re.sub(r"(composer|ValueError)\((['\"])", r"\1(f\2", changed)
 
 
 def with_open_drawer(meant: Instruction, names: Sequence[Name]) -> tuple[Instruction, OpenDrawer | None]:

@@ -113,13 +113,9 @@ class _Cases:
             for handle in _Planner(self._names).operated(action.thing, "handle")
         ]
         return [
-            line
+            f"if not detect({handle!r}).is_open: raise ValueError('{stem} is closed, and must not be opened')"
             for handle in handles
-            if handle.removesuffix("_handle") in into
-            for line in (
-                f"if not detect({handle!r}).is_open:",
-                f"    raise ValueError('{handle.removesuffix('_handle')} is closed, and must not be opened')",
-            )
+            if (stem := handle.removesuffix("_handle")) in into
         ]
 
     def _test(self, condition: Condition) -> tuple[list[str], str]:
@@ -225,8 +221,11 @@ class _Planner:
         if len(found.names) != 2 or not found.noun.plural:
             raise NotUnderstood(f"{str(action.thing)!r}: just two things can be put on or next to each other")
         first, second = (Noun(words=(name.text,)) for name in found.names)
+        if action.verb == "stack" and place is not None and not to_each_other:
+            upper = Place(relation="on", thing=second)
+            return [replace(action, verb="put", thing=second), replace(action, verb="put", thing=first, place=upper)]
         relation = place.relation if place is not None and place.relation in BESIDE else "on"
-        return [Action(verb="put", thing=first, place=Place(relation=relation, thing=second))]
+        return [replace(action, verb="put", thing=first, place=Place(relation=relation, thing=second))]
 
     def _check(self, meant: Instruction, actions: Sequence[Action]) -> None:
         """Refuse orders that contradict each other."""
