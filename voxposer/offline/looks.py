@@ -12,17 +12,17 @@ from collections.abc import Iterator, Sequence
 from voxposer.offline.grounding import Found, ground, is_table, refs_of
 from voxposer.offline.meaning import Action, Noun, Relation
 from voxposer.offline.names import Name, NotUnderstood
-from voxposer.offline.query_writer import SCALE, SIDES_OF, Locator, is_on
+from voxposer.offline.query_writer import SIDES_OF, Locator, is_on
 
 # Centimetres that the underside of a thing may be off the bounds of what it stands on, or is in: drawers are one above
 # the other.
 _OFF_ON, _OFF_IN = 4, 1.5
 _RESTING = frozenset(["on", "in", "top_of", "from"])
 RESTS = [
-    SCALE,
-    "foot = lambda it: (it.aabb[0] + it.aabb[1] * np.array([1, 1, 0])) / np.array([2, 2, 1])",
-    "off = lambda foot, low, high: np.linalg.norm(np.maximum(np.maximum(low - foot, foot - high), 0) * cm)",
-    "rests = lambda name, at, most: off(foot(detect(name)), at.aabb[0], at.aabb[1]) < most",
+    "cm = np.array([index2cm(1, axis) for axis in 'xyz'])",
+    "foot = lambda box: (box[0] + box[1] * np.array([1, 1, 0])) / np.array([2, 2, 1])",
+    "off = lambda foot, box: np.linalg.norm(np.maximum(np.maximum(box[0] - foot, foot - box[1]), 0) * cm)",
+    "rests = lambda name, at, most: off(foot(detect(name).aabb), at.aabb) < most",
 ]
 
 
@@ -81,10 +81,10 @@ def _premise(found: Found, noun: Noun, relation: Relation, names: Sequence[Name]
         return ""
     lines, test = looked
     listed = ", ".join(repr(name.text) for name in found.names)
-    count = f"len([name for name in [{listed}] if {'not ' if relation.negated else ''}{test}])"
+    count = f"sum([{'not ' if relation.negated else ''}{test} for name in [{listed}]])"
     least = several if noun.plural or noun.indefinite or not relation.negated else 1
     wrong = f"{count} != 1" if relation.negated and not (noun.plural or noun.indefinite) else f"{count} < {least}"
-    return "\n".join([*lines, f"if {wrong}: raise ValueError({f'there is no such object: {noun}'!r})"])
+    return "\n".join([*lines, f"if {wrong}: raise ValueError({f'no such object: {noun}'!r})"])
 
 
 def looked_at(ref: Noun, relation: Relation, names: Sequence[Name]) -> tuple[list[str], str] | None:
