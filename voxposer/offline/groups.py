@@ -70,6 +70,7 @@ def _is_pair(cursor: Cursor) -> bool:
 
 
 def _group(cursor: Cursor) -> Group:
+    cursor.take("only", "just")
     noun = read_noun_phrase(cursor)
     if noun is not None and noun.is_pronoun:
         cursor.take("both", "all", "each")
@@ -79,6 +80,7 @@ def _group(cursor: Cursor) -> Group:
     back = cursor.peek() == "back"
     if not cursor.sees("out of", "over to", "up to") and not (back and _is_length(cursor)):
         cursor.take("up", "down", "back", "out", "away", "over")
+    cursor.take(*_SO_THAT) if noun is not None else None
     phrases = read_phrases(cursor)
     if back and not phrases and (cursor.at_end or cursor.peek() in {",", ".", "and", "then"}):
         raise NotUnderstood(f"'back' to where? Where {noun or 'it'} was before is not remembered")
@@ -87,6 +89,14 @@ def _group(cursor: Cursor) -> Group:
     if noun is None and len(phrases) == 1 and cursor.peek() in {"the", "a", "an", "both", "all"}:
         noun = read_noun_phrase(cursor)
     return noun, phrases
+
+
+# "Move the cup so that it is in front of the plate" is "move the cup in front of the plate".
+_SO_THAT = tuple(
+    f"{so} {it}"
+    for so in ("so that", "such that", "so", ", so that", ", such that", ", so")
+    for it in ("it is", "they are", "it stands", "they stand", "it lies", "they lie", "it sits", "it ends up")
+)
 
 
 def _without_another(cursor: Cursor, noun: Noun | None) -> Noun | None:

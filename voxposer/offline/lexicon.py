@@ -24,7 +24,7 @@ def phrases(text: str) -> frozenset[tuple[str, ...]]:
 # Action -> verbs that mean it, in the base form.
 _VERBS: Mapping[str, str] = {
     "put": """put place set drop deposit move bring transfer lay toss throw stick carry relocate shift insert position
-    return stow store dump load deliver""",
+    return stow store dump load deliver chuck pop plop""",
     "pick": "pick grab grasp lift take get fetch raise seize collect hold",
     "push": "push slide shove nudge",
     "stack": "stack pile",
@@ -104,7 +104,8 @@ OPENED: Mapping[str, str] = {"open": "open", "opened": "open", "closed": "closed
 POLITE = phrases(
     """would you mind|would you be so kind as to|would you be able to|could you be so kind as to
     can you|could you|would you|will you|i want you to|i need you to|i would like you to|i'd like you to|we need you to
-    you should|you must|you need to|you have to|you can|you may|you are to|your task is to|your job is to|please|kindly
+    you should|you must|you need to|you have to|you can|you may|you are to|your task is to|your job is to|please
+    please to|kindly|only
     make sure to|make sure that you|be sure to|try to|go ahead and|go and|proceed to|start by|begin by|let us|let's
     remember to|hey robot|robot|hey|ok|okay|hi|hello|now|just|simply|so|well|also|help me|help me to|i want to
     i would like to|i'd like to|let me see you|it is time to|it's time to|your goal is to
@@ -118,7 +119,7 @@ FILLERS = phrases(
     immediately|at once|one after the other|one after another|one by one|one at a time|together|neatly|properly|directly
     if you can|if possible|if you please|will you|would you|could you|can you|this time|completely|fully|all the way
     afterwards|just|simply|straight|right there|safely|of course|thank you very much|thanks a lot|many thanks
-    thank you so much|if you do not mind|if that is ok|if it is possible
+    thank you so much|mate|buddy|my friend|robot|if you do not mind|if that is ok|if it is possible
     on your own|at the end|while doing so|while doing this|while doing that|in the process|meanwhile|if you would
     if you could"""
 )
@@ -132,7 +133,7 @@ THEN = phrases(
     and last of all"""
 )
 BEFORE = ("before", "prior to")
-AFTER = ("after", "once", "as soon as", "when", "having", "after having")
+AFTER = ("after", "once", "as soon as", "when", "having", "after having", "only after", "only once", "only when")
 # Modal verbs and what else stands between a subject and what is to become of it.
 MODALS = phrases(
     """should now|should|must|shall|ought to|needs to|need to|has to|have to|is to|are to|is supposed to
@@ -181,9 +182,9 @@ _PREPOSITIONS: Mapping[str, str] = {
     from the center of|from the middle of|from the centre of""",
     "top_of": "on top of|on the top of|to the top of|to top of|onto the top of|onto top of|atop|on to the top of",
     "left_of": """to the left of|on the left of|at the left of|left of|to left of|to the left side of
-    on the left side of|at the left side of""",
+    on the left side of|at the left side of|left to|left from|to the left from|on the left from""",
     "right_of": """to the right of|on the right of|at the right of|right of|to right of|to the right side of
-    on the right side of|at the right side of""",
+    on the right side of|at the right side of|right from|to the right from|on the right from""",
     "front_of": "in front of|to the front of|at the front of|to front of|on the front of",
     "back_of": "behind|to the back of|at the back of|in back of|at the rear of|to the rear of",
     "near": """next to|adjacent to|close to|near to|beside|alongside|near|nearby|by the side of|by|right next to

@@ -253,6 +253,9 @@ def _ends_words(cursor: Cursor, last: str) -> bool:
         last in {"it", "them", "itself", "there", "they"}
         or (token in STATES and not is_word(after))
         or (token in SIDE_WORDS and after == "of")
+        or (token in {"left", "right"} and after == "from")
+        or (token == "left" and after == "to")
+        or (token == "right" and after in _BEFORE_PLACES - {"", ",", ".", "and", "then", "to"})
         or _starts_length(cursor)
         or (token in {"can", "will", "may", "might", "could"} and after in {"be", "go", "not"})
         or (token == "back" and after in _BEFORE_PLACES)

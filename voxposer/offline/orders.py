@@ -63,6 +63,8 @@ def _verb_phrase(cursor: Cursor, base: str) -> Clause:
         {"up", "down", "over", "out", "away", "back"} - ({"back"} if _is_noun_next(cursor) else set())
     )
     cursor.take("on to", "onto") if base == "hold" else None
+    if cursor.peek() == "and" and cursor.peek(1) in VERBS and (shared := _shared(cursor, action, state)) is not None:
+        return shared
     moved = read_shift(cursor)
     groups, out = _not_but(cursor) if cursor.peek() in {"neither", "not"} else (read_groups(cursor), [])
     state = state or take_state(cursor, switched=switched)
@@ -70,6 +72,22 @@ def _verb_phrase(cursor: Cursor, base: str) -> Clause:
     clause = meant(cursor, action, groups, state, particle, moved)
     clause.ruled_out += out
     return clause
+
+
+def _shared(cursor: Cursor, action: str, state: str) -> Clause | None:
+    """ "Open and close the drawer", "pick up and place the bowl on the plate": the object stands behind both verbs."""
+    start = cursor.at
+    cursor.next()
+    clause = imperative(False)(cursor)
+    if clause is None or not clause.groups or clause.groups[0][0] is None or clause.groups[0][0].is_pronoun:
+        cursor.at = start
+        return None
+    if action == "pick" and clause.verb == "put":
+        return clause
+    cursor.at = start
+    if action not in {"open", "close"} or clause.verb not in {"open", "close"} or state:
+        return None
+    return Clause(action, [(noun, list(phrases)) for noun, phrases in clause.groups])
 
 
 def _not_but(cursor: Cursor) -> tuple[list[Group], list[Phrase | Noun]]:

@@ -11,8 +11,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from voxposer.offline.grammar import read_noun, understand
-from voxposer.offline.grounding import Found, ground, holder, is_fixture, is_table, refs_of, with_words
-from voxposer.offline.lexicon import GENERIC, words
+from voxposer.offline.grounding import (
+    CONTAINERS,
+    SUPPORTS,
+    Found,
+    ground,
+    holder,
+    holds_things,
+    is_fixture,
+    is_table,
+    refs_of,
+    with_words,
+)
+from voxposer.offline.lexicon import GENERIC
 from voxposer.offline.looks import RESTS, looked_at, presupposed
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Condition, Instruction, Noun, Place, Ranking
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
@@ -37,9 +48,6 @@ from voxposer.offline.references import Moves
 
 # Steps that take a door through its range.
 DOOR_STEPS = 6
-# Objects that "to" puts things into, and those it puts things next to: all that are not supports.
-_CONTAINERS = frozenset(words("basket tray drawer microwave caddy compartment bowl bin box mug"))
-_SUPPORTS = frozenset(words("plate stove cabinet shelf rack towel cloth table burner level top ramekin"))
 # What orders by size, which stays the same while an object is carried.
 _SIZES = frozenset(["large", "small", "tall", "short", "long"])
 
@@ -331,6 +339,8 @@ class _Planner:
         found = self._moves.while_held(self._moves.since_moved(_place_thing(place, self._names)), thing)
         if place.relation in BESIDE | {"to", "towards"}:
             return self._single(found)
+        if place.relation == "in" and not any(holds_things(name, self._names) for name in found.names):
+            raise NotUnderstood(f"nothing can be put in {place.thing}")
         part = holder(_holding(place.relation), found.names[0], self._names) if found.is_settled else None
         if place.relation == "under" and part is None and not (found.is_settled and found.names[0].is_part):
             raise NotUnderstood(f"nothing can be put under {place.thing}")
@@ -411,7 +421,7 @@ class _Planner:
             words = {
                 word for name in _place_thing(place, self._names).names for word in (*name.part_words, *name.words)
             }
-            relation = "in" if words & _CONTAINERS else "on" if words & _SUPPORTS else "near"
+            relation = "in" if words & CONTAINERS else "on" if words & SUPPORTS else "near"
         return Place(relation=relation, thing=place.thing, second=place.second, cm=place.cm)
 
     def _between(self, place: Place) -> str:

@@ -250,7 +250,8 @@ def _at(values: str, least: bool, rank: int) -> str:
 
 def is_on(relation: Relation) -> bool:
     """Whether the phrase says that an object stands on another; "from" a container means that it was in it."""
-    inside = relation.kind == "from" and bool(_CONTAINERS.intersection(relation.refs[0].words))
+    said = {part for word in relation.refs[0].words for part in word.split("_")}
+    inside = relation.kind == "from" and bool(_CONTAINERS & said)
     return relation.kind in {"on", "top_of", "from"} and not inside
 
 

@@ -24,9 +24,9 @@ _SHORTEST, _SHORTEST_REPLACED = 4, 6
 
 def corrected(tokens: Sequence[str], names: Sequence[Name]) -> tuple[list[str], tuple[tuple[str, str], ...]]:
     """The tokens with typing errors corrected, and pairs of what was written and what it is taken for."""
+    tokens, changed = _joined(tokens, names)
     known = KNOWN | KINDS | {form for name in names for word in name.senses for form in (word, f"{word}s")}
     known |= {name.text.lower() for name in names}
-    changed: dict[str, str] = {}
     for token in dict.fromkeys(tokens):
         if token in known or not (token.isascii() and token.isalpha()):
             continue
@@ -34,6 +34,20 @@ def corrected(tokens: Sequence[str], names: Sequence[Name]) -> tuple[list[str], 
         if meant:
             changed[token] = meant
     return [changed.get(token, token) for token in tokens], tuple(changed.items())
+
+
+def _joined(tokens: Sequence[str], names: Sequence[Name]) -> tuple[list[str], dict[str, str]]:
+    """The tokens with names that were written apart joined, "egg plant", and what was joined."""
+    words = {form for name in names for word in name.senses for form in (word, f"{word}s") if len(word) > _SHORTEST}
+    joined: list[str] = []
+    changed: dict[str, str] = {}
+    for token in tokens:
+        if joined and joined[-1] + token in words and joined[-1] not in KNOWN:
+            changed[f"{joined[-1]} {token}"] = joined[-1] + token
+            joined[-1] += token
+        else:
+            joined.append(token)
+    return joined, changed
 
 
 def _meant(token: str, known: Collection[str]) -> str:

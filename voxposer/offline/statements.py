@@ -55,7 +55,7 @@ def statement(past: bool) -> Callable[[Cursor], Clause | None]:
             return predicate(cursor, groups)
         if not (ordered or linked):
             return None
-        done = past and cursor.peek() in PARTICIPLES
+        done = past and (cursor.peek() in PARTICIPLES or cursor.sees(*_WHERE))
         if not (ordered or done or cursor.sees("to be", "not to be", "to go")):
             raise NotUnderstood(f"{' '.join(cursor.tokens[start:])!r} says what is, not what to do")
         return predicate(cursor, groups)
@@ -78,6 +78,8 @@ def _named_first(cursor: Cursor, groups: list[Group]) -> Clause | None:
     return clause
 
 
+# What begins a place: "once the pot is (standing) on the stove" is an order to put it there.
+_WHERE = ("standing", "lying", "sitting", "on", "in", "inside", "next to", "beside", "behind", "between", "under")
 _LINKS = frozenset(["has", "have", "is", "are", "gets", "get", "was", "were", "been", "being"])
 # The last words of "make sure that", "see to it that" and the like.
 _ASSURED = frozenset(["sure", "that"])
@@ -142,10 +144,12 @@ def predicate(cursor: Cursor, groups: list[Group]) -> Clause | None:
         state = STATES[word]
         clause = Clause(f"turn_{state}" if state in {"on", "off"} else state, groups)
     else:
-        cursor.take("somewhere", "placed")
+        cursor.take("somewhere", "placed", "standing", "lying", "sitting")
         phrases = read_phrases(cursor)
         if not phrases:
             return None
+        if negated and cursor.take(", but rather", ", but", "but rather", "but") and (instead := read_phrases(cursor)):
+            negated, phrases = False, instead
         groups[-1] = (groups[-1][0], [*groups[-1][1], *phrases])
         clause = Clause("put", groups)
     clause.forbidden = negated

@@ -41,6 +41,7 @@ _SPELLINGS = (
     (r"\bfrying pan(s?)\b", r"frypan\1"),
     (r"\b(?:layer|level) of (?:the )?drawers?\b", "drawer"),
     (r"\b(?:the )?table (?:center|centre|middle)\b", "the center of the table"),
+    (r"\b(?:whichever|whatever) ((?:[a-z]+ ){1,3}?)(is|are)\b", r"the \1that \2"),
     (r"&", " and "),
 )
 
