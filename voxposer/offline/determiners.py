@@ -34,7 +34,8 @@ _STOPS = (
             """and or but then not that which who whose except excluding without before after once while when as is are
             was were be been goes go belongs belong of , . ( ) where than so if until unless nor neither besides apart
             other others again at you we i has have had need needs there here ends sits stands lies forward forwards
-            backward backwards alone untouched halfway midway somewhere immediately otherwise else exactly precisely only"""
+            backward backwards alone untouched halfway midway somewhere immediately otherwise else exactly precisely
+            only"""
         )
     )
 )

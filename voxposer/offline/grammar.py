@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from voxposer.offline import mentions
 from voxposer.offline.clause import Clause, Group
 from voxposer.offline.clauses import read_clauses
 from voxposer.offline.grounding import ground, is_table
 from voxposer.offline.meaning import BESIDE, Action, Avoidance, Condition, Instruction, Noun, Place, Ranking, Relation
-from voxposer.offline.mentions import BEARERS, VERBS_SAID, carrying, described_words, inner_nouns, is_hollow
+from voxposer.offline.mentions import BEARERS, VERBS_SAID, carrying, described_words, inner_nouns
 from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, read_phrase, read_phrases
 from voxposer.offline.spelling import corrected
@@ -73,14 +74,6 @@ def read_noun(text: str) -> Noun:
     if noun is None or not cursor.at_end:
         raise NotUnderstood(f"{text!r} cannot be parsed as a description of an object")
     return noun
-
-
-def _stacked(placed: list[Action]) -> list[Action]:
-    """ "Stack the bowl and the cup on the plate": each on the one before."""
-    if len(placed) < 2 or any(action.thing.plural or action.place != placed[0].place for action in placed):
-        return placed
-    supports = [placed[0].place, *(Place(relation="on", thing=action.thing) for action in placed)]
-    return [replace(action, place=support) for action, support in zip(placed, supports, strict=False)]
 
 
 def read_between(text: str) -> tuple[Noun, Noun]:
@@ -165,10 +158,8 @@ class _Reader:
             return None
         if clause.forbidden or clause.verb in {"avoid", "untouched"} or clause.verb.startswith("keep_"):
             raise NotUnderstood(f"a condition of what not to do is not understood: {clause.said!r}")
-        thing = spoken.thing
-        if thing.is_pronoun and clause.trails and clause.groups[:1] and clause.groups[0][0] is not None:
-            thing = clause.groups[0][0]
-        thing = self._thing(thing)
+        own = clause.groups[0][0] if clause.trails and clause.groups else None
+        thing = self._thing(own if own is not None and spoken.thing.is_pronoun else spoken.thing)
         if not clause.trails and (self._condition is None or self._condition.thing != thing):
             self._mention(thing)
             self._fixture = thing
@@ -359,16 +350,9 @@ class _Reader:
             for thing in self._moving(noun, describing):
                 self._mention(thing)
                 placed.append(self._action(verb, thing, place, clause, placed))
-        placed = _stacked(placed) if verb == "stack" else self._together(placed)
+        placed = mentions.stacked(placed) if verb == "stack" else mentions.together(placed)
         self._check_ruled_out(clause, placed)
-        self._add(placed, verb, clause.when)
-
-    def _together(self, placed: list[Action]) -> list[Action]:
-        """ "The ramekin and the cookies next to each other": the first goes to the second."""
-        places = [action.place for action in placed if action.place and action.place.thing.words == ("each other",)]
-        if len(placed) != 2 or len(places) != 2 or places[0].relation not in BESIDE:
-            return placed
-        return [replace(placed[0], place=replace(places[0], thing=placed[1].thing))]
+        self._add(placed, clause.when)
 
     def _split(
         self, noun: Noun | None, phrases: Sequence[Phrase], later: Sequence[Group], clause: Clause
@@ -466,7 +450,7 @@ class _Reader:
                 and where in bearing
                 and phrase.kind in bearing - ({"top_of"} if where == "in" else set())
             ):
-                if phrase.kind == "in" and last is not None and is_hollow(last) and where != "in":
+                if phrase.kind == "in" and last is not None and mentions.is_hollow(last) and where != "in":
                     return last
                 raise NotUnderstood(f"'{phrase.said} {noun.words[0]}' could be {last} or what it is put on or in")
             if before is not None:
@@ -495,7 +479,7 @@ class _Reader:
                 self._rule_out(clause, things)
                 placed[:] = [replace(action, thing=thing) for action, thing in zip(placed, things, strict=True)]
 
-    def _add(self, actions: list[Action], verb: str, when: float) -> None:
+    def _add(self, actions: list[Action], when: float) -> None:
         actions = [replace(action, condition=self._condition) for action in actions]
         stack, self._put_on = self._put_on, None
         if stack is not None and stack.place is not None and [action.thing for action in actions] in carrying(stack):
@@ -504,7 +488,6 @@ class _Reader:
             actions = [carry, stack]
         elif len(actions) == 1 and actions[0].verb == "put":
             self._put_on = actions[0]
-        del verb
         self._moved = [action.thing for action in actions]
         places = [action.place for action in actions if action.place]
         if places:

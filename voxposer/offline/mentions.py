@@ -1,9 +1,11 @@
-"""What was said of objects before, and what "one", "it" and "them" can repeat of it."""
+"""What was said of objects before, what "one" and "it" can repeat of it, and objects that go to one another."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from voxposer.offline.lexicon import SIDE_WORDS, SIZES, words
-from voxposer.offline.meaning import Action, Noun
+from voxposer.offline.meaning import BESIDE, Action, Noun, Place
 from voxposer.offline.names import COLOURS
 
 # Actions that a clause without a verb can repeat.
@@ -40,3 +42,19 @@ def inner_nouns(noun: Noun) -> list[Noun]:
     if noun.ranking is not None and noun.ranking.ref is not None:
         refs.append(noun.ranking.ref)
     return [*(part for ref in refs for part in inner_nouns(ref)), noun]
+
+
+def stacked(placed: list[Action]) -> list[Action]:
+    """ "Stack the bowl and the cup on the plate": each on the one before."""
+    if len(placed) < 2 or any(action.thing.plural or action.place != placed[0].place for action in placed):
+        return placed
+    supports = [placed[0].place, *(Place(relation="on", thing=action.thing) for action in placed)]
+    return [replace(action, place=support) for action, support in zip(placed, supports, strict=False)]
+
+
+def together(placed: list[Action]) -> list[Action]:
+    """ "The ramekin and the cookies next to each other": the first goes to the second."""
+    places = [action.place for action in placed if action.place and action.place.thing.words == ("each other",)]
+    if len(placed) != 2 or len(places) != 2 or places[0].relation not in BESIDE:
+        return placed
+    return [replace(placed[0], place=replace(places[0], thing=placed[1].thing))]
