@@ -37,7 +37,8 @@ class Writer:
             text, finish = _written(json.dumps(messages), tuple(stop), max_tokens)
         except NotUnderstood as error:
             raise NoRuleError(self.config.model, str(error)) from error
-        assert finish == "stop", f"more than {max_tokens} tokens: {text}"
+        if finish != "stop":
+            raise NoRuleError(self.config.model, f"its program has more than {max_tokens} tokens")
         return Reply(text=text, model="writer", finish_reason=finish, prompt_tokens=0, completion_tokens=0, cost_usd=0)
 
 

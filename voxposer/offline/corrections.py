@@ -72,7 +72,10 @@ def _take_back(kept: list[str], cursor: Cursor) -> None:
     places = [index for index in places if index - 1 not in places]
     said = f"{' '.join(kept)} , ... {cursor.rest}"
     if cursor.peek() in VERBS:
-        if len(verbs) != 1:
+        # "..., wait, turn on the stove first" takes nothing back.
+        rest = cursor.tokens[cursor.at :]
+        added = {"first", "before", "too", "also"} & set(rest[: rest.index(".") if "." in rest else len(rest)])
+        if len(verbs) != 1 or added:
             raise NotUnderstood(f"which order is taken back in {said!r}? Say only what is to be done")
         del kept[verbs[0] :]
     elif _is_place(cursor):

@@ -59,7 +59,7 @@ def is_fixture(name: Name, names: Sequence[Name]) -> bool:
 def holds_things(name: Name, names: Sequence[Name]) -> bool:
     """Whether "in" it can be a place; "in the plate" is said of what is on it."""
     parts = {word for other in names if other.whole == name.text for word in other.words}
-    return bool((parts | name.senses) & (CONTAINERS | SUPPORTS | _HOLLOW))
+    return bool((parts | {*name.words}) & (CONTAINERS | SUPPORTS | _HOLLOW))
 
 
 def ground(noun: Noun, names: Sequence[Name]) -> Found:

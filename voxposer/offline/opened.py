@@ -42,7 +42,7 @@ class OpenDrawer:
         part = rf"{re.escape(self.stems[0])}_(drawer|handle)"
         line = re.sub(rf"detect\('{part}'\)", r"detect(drawer + '_\1')", line)
         changed = re.sub(part, r"{drawer}_\1", line)
-        return line if changed == line else re.sub(r"(composer|ValueError)\((['\"])", r"\1(f\2", changed)
+        return re.sub(r"""(?<!\w)("[^"]*\{drawer\}[^"]*"|'[^']*\{drawer\}[^']*')""", r"f\1", changed)
 
 
 def with_open_drawer(meant: Instruction, names: Sequence[Name]) -> tuple[Instruction, OpenDrawer | None]:

@@ -15,7 +15,7 @@ from voxposer.offline.looks import RESTS, looked_at, presupposed
 from voxposer.offline.meaning import Action, Avoidance, Condition, Instruction
 from voxposer.offline.names import Name, NotUnderstood, read_names
 from voxposer.offline.opened import with_open_drawer
-from voxposer.offline.programs import AVOID, Block, program
+from voxposer.offline.programs import AVOID, Block, in_one_line, program
 from voxposer.offline.subtasks import SubtaskWriter
 
 
@@ -57,7 +57,7 @@ class _Cases:
             self._case([action for action in self._meant.actions if _applies(action, negated)])
             for negated in (False, True)
         ]
-        then, otherwise = ([f"    {line}" for line in case] for case in cases)
+        then, otherwise = ([f"    {line}" for line in in_one_line(case)] for case in cases)
         branches = [f"if {test}:", *then, "else:", *otherwise] if otherwise else [f"if {test}:", *then]
         branches = branches if then else [f"if not ({test}):", *otherwise]
         return self._with_rests([*looked, *branches])

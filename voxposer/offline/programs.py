@@ -45,6 +45,21 @@ def program(blocks: Sequence[Block]) -> list[str]:
     return lines
 
 
+def in_one_line(lines: Sequence[str]) -> list[str]:
+    """The same lines with subtasks that follow one another in one: where lines are indented, that is much shorter."""
+    joined: list[str] = []
+    sentences: list[str] = []
+    for line in [*lines, ""]:
+        if line.startswith('composer("'):
+            sentences.append(line.removeprefix("composer(").removesuffix(")"))
+            continue
+        if sentences:
+            joined.append(f"for each in [{', '.join(sentences)}]: composer(each)")
+            sentences = []
+        joined.append(line)
+    return joined[:-1]
+
+
 def _pattern(block: Block) -> tuple[str, ...]:
     if not block.thing:
         return block.sentences
