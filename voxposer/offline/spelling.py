@@ -52,9 +52,10 @@ def _joined(tokens: Sequence[str], names: Sequence[Name]) -> tuple[list[str], di
 
 def _meant(token: str, known: Collection[str]) -> str:
     """The known word that a word is a misspelling of; "" if it is none, or could be of several."""
-    if len(token) < _SHORTEST - 1 or _dictionary().known([token]):
+    dictionary = _dictionary() if len(token) >= _SHORTEST - 1 else None
+    if dictionary is None or dictionary.known([token]):
         return ""
-    near = {word for word in _dictionary().edit_distance_1(token) if word in known and _is_slip(token, word)}
+    near = {word for word in dictionary.edit_distance_1(token) if word in known and _is_slip(token, word)}
     near = {word for word in near if not (word.endswith("s") and word[:-1] in near)}
     return near.pop() if len(near) == 1 else ""
 
@@ -68,8 +69,11 @@ def _is_slip(written: str, word: str) -> bool:
 
 
 @functools.cache
-def _dictionary() -> SpellChecker:
+def _dictionary() -> SpellChecker | None:
+    """English words; None without pyspellchecker, which the rule base can do without: such words are refused then."""
     # Loading the dictionary takes a tenth of a second, which sentences without unknown words need not wait for.
-    from spellchecker import SpellChecker
-
+    try:
+        from spellchecker import SpellChecker
+    except ImportError:
+        return None
     return SpellChecker(language="en", distance=1)
