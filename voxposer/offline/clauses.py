@@ -145,6 +145,8 @@ class _Sentence:
             self._clause(self._clauses[-1].when - 0.5)
             return
         if cursor.take(*BEFORE):
+            if self._clauses and self._clauses[-1].forbidden and not fresh:
+                raise NotUnderstood(f"not {self._clauses[-1].said!r} before something else? Say what to do, in order")
             later = self._subordinate(last + 1)
             if fresh:
                 self._separator()
@@ -205,9 +207,11 @@ class _Sentence:
         self._clauses.append(clause)
         self._ruled_out(clause)
         self._conditioned(clause)
-        if len(self._clauses) > 1 and cursor.peek() == "first" and at_clause_end(cursor, 1):
+        if cursor.peek() == "first" and at_clause_end(cursor, 1):
             cursor.next()
-            clause.when = self._clauses[-2].when - 0.5
+            if sum(bool(phrases) for _, phrases in clause.groups) > 1:
+                raise NotUnderstood(f"which part of {clause.said!r} is to be first? Say it as two sentences")
+            clause.when = self._clauses[-2].when - 0.5 if len(self._clauses) > 1 else when
         return clause
 
     def _conditioned(self, clause: Clause) -> None:

@@ -21,8 +21,7 @@ from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, 
 from voxposer.offline.spelling import corrected
 from voxposer.offline.tokens import Cursor, tokenize
 
-# Longer texts are no instructions, and cost time.
-_MOST_WORDS = 200
+_MOST_WORDS = 200  # longer texts are no instructions, and cost time
 
 
 def read_instruction(text: str, objects: Sequence[str] = ()) -> tuple[Action, ...]:
@@ -379,7 +378,9 @@ class _Reader:
     def _moving(self, noun: Noun | None, describing: list[Phrase]) -> list[Noun]:
         """The objects to put: the noun's, else those picked up, else those put somewhere before."""
         if noun is not None and not noun.is_pronoun:
-            return [self._resolved(qualified(noun, describing))]
+            thing = self._resolved(qualified(noun, describing))
+            self._picked = [picked for picked in self._picked if picked != thing]
+            return [thing]
         word = noun.words[0] if noun else ""
         if word in {"itself", "themselves", "there", "one", "each other"}:
             raise NotUnderstood(f"{word!r} refers to nothing said before")
@@ -468,12 +469,11 @@ class _Reader:
         """ ", not on the right plate": it must be another place than the one that is said."""
         for out in clause.ruled_out:
             if isinstance(out, Phrase) and out.thing is not None and out.kind in PLACES:
-                noun = self._headed(out.thing, [action.place.thing for action in placed if action.place])
-                if any(
-                    action.place and action.place.thing == noun and out.kind == action.place.relation
-                    for action in placed
-                ):
-                    raise NotUnderstood(f"{clause.said!r} is ruled out by 'not {out.said} {noun}'")
+                places = [action.place for action in placed if action.place]
+                noun = self._headed(out.thing, [place.thing for place in places])
+                unclear = {out.kind, "near"} if out.kind in BESIDE else {out.kind}  # on which side is "next to"?
+                if any(place.relation in unclear and (noun.is_pronoun or place.thing == noun) for place in places):
+                    raise NotUnderstood(f"{clause.said!r} is ruled out by 'not {out.said} {noun}', or may be")
             elif isinstance(out, Noun):
                 things = [action.thing for action in placed]
                 self._rule_out(clause, things)

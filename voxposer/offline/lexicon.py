@@ -105,7 +105,7 @@ POLITE = phrases(
     """would you mind|would you be so kind as to|would you be able to|could you be so kind as to
     can you|could you|would you|will you|i want you to|i need you to|i would like you to|i'd like you to|we need you to
     you should|you must|you need to|you have to|you can|you may|you are to|your task is to|your job is to|please
-    please to|kindly|only
+    please to|kindly|only|if you can|if possible|if you like|if you please
     make sure to|make sure that you|be sure to|try to|go ahead and|go and|proceed to|start by|begin by|let us|let's
     remember to|hey robot|robot|hey|ok|okay|hi|hello|now|just|simply|so|well|also|help me|help me to|i want to
     i would like to|i'd like to|let me see you|it is time to|it's time to|your goal is to

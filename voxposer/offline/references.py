@@ -53,7 +53,8 @@ class Moves:
             noun: the description.
             place: where they go, by which those that were moved already are told from the others.
         """
-        if noun.words[-1] in GENERIC and noun.number is not None and place is not None and not is_table(place.thing):
+        counted = noun.words[-1] in GENERIC and noun.number is not None and not (noun.ranking or noun.relation)
+        if counted and place is not None and not is_table(place.thing):
             # "Two things" are two besides the one that they are put on.
             there = [Noun(words=(name.text,)) for name in ground(place.thing, self._names).names]
             noun = replace(noun, excluded=(*noun.excluded, *there))

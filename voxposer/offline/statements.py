@@ -55,7 +55,9 @@ def statement(past: bool) -> Callable[[Cursor], Clause | None]:
             return predicate(cursor, groups)
         if not (ordered or linked):
             return None
-        done = past and (cursor.peek() in PARTICIPLES or cursor.sees(*_WHERE))
+        # "When the pot is on the stove" may be a condition.
+        placed = cursor.sees(*_WHERE) and cursor.tokens[max(start - 1, 0)] != "when"
+        done = past and (cursor.peek() in PARTICIPLES or placed)
         if not (ordered or done or cursor.sees("to be", "not to be", "to go")):
             raise NotUnderstood(f"{' '.join(cursor.tokens[start:])!r} says what is, not what to do")
         return predicate(cursor, groups)

@@ -31,6 +31,7 @@ _SPELLINGS = (
     (r"\b(i|we|you)'d like\b", r"\1 would like"),
     (r"\b(is|are|was|were|does|do|should|must|need)n'?t\b", r"\1 not"),
     (r"\b(?:cannot|can't)\b", "can not"),
+    (r"\blet's\b", "let us"),
     (r"\bwon't\b", "will not"),
     (r"\b(\w+)'s (left|right|front|back|rear)(?: hand)?(?: side)?(?=\s*(?:$|[.,;!?]|and\b|then\b))", r"\2 of the \1"),
     (
