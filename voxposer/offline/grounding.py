@@ -230,6 +230,12 @@ def holder(relation: str, name: Name, names: Sequence[Name]) -> Name | None:
     return found
 
 
+def handle_of(name: Name, names: Sequence[Name]) -> str | None:
+    """The handle of a drawer, or of a thing with one door; None for what has none."""
+    stem = name.text.removesuffix("_drawer").removesuffix("_inside")
+    return next((other.text for other in names if other.text == f"{stem}_handle"), None)
+
+
 def _part_of(whole: str, names: Sequence[Name], wanted: Sequence[set[str]]) -> Name | None:
     """The first part of a thing with exactly the wanted words, in order of preference."""
     parts = [name for name in names if name.whole == whole and name.is_part]

@@ -200,7 +200,7 @@ def _noun(
         words=tuple(map(singular, words)),
         ranking=ranking,
         plural=many and not single,
-        indefinite=found.indefinite or single,
+        indefinite=(found.indefinite and not (many and found.number)) or single,
         number=number,
         exact=exact,
         excluded=tuple(Noun(words=(word,)) for word in excluded),

@@ -59,7 +59,7 @@ def with_open_drawer(meant: Instruction, names: Sequence[Name]) -> tuple[Instruc
             noun = replace(noun, relation=replace(relation, refs=tuple(map(exchanged, relation.refs))))
         if ranking is not None and ranking.ref is not None:
             noun = replace(noun, ranking=replace(ranking, ref=exchanged(ranking.ref)))
-        drawer = _drawer(noun, names, implied=implied)
+        drawer = _drawer(noun, names, implied=implied or bool(found))
         if drawer is None:
             return noun
         found.append(drawer)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from voxposer.offline.grammar import understand
-from voxposer.offline.grounding import ground, is_table
+from voxposer.offline.grounding import ground, handle_of, is_table
 from voxposer.offline.looks import RESTS, looked_at, presupposed
 from voxposer.offline.meaning import Action, Avoidance, Condition, Instruction
 from voxposer.offline.names import Name, NotUnderstood, read_names
@@ -74,24 +74,30 @@ class _Cases:
         return [*presupposed(actions, self._names), *self._open_already(actions), *program(said)]
 
     def _open_already(self, actions: Sequence[Action]) -> list[str]:
-        """Lines that check that what must not be opened, and something is to be put in, is open."""
-        into = [
-            name.whole if not name.is_part else name.text.rpartition("_")[0]
-            for action in actions
-            if action.place is not None and action.place.relation == "in" and not is_table(action.place.thing)
-            for name in ground(action.place.thing, self._names).names
-        ]
-        handles = [
-            handle.removeprefix("the ")
-            for action in self._meant.forbidden
-            if action.verb == "open"
-            for handle in SubtaskWriter(self._names).operated(action.thing, "handle")
-        ]
-        return [
-            f"if not detect({handle!r}).is_open: raise ValueError('{stem} is closed, and must not be opened')"
-            for handle in handles
-            if (stem := handle.removesuffix("_handle")) in into
-        ]
+        """Lines that check that what must not be opened, and something is to be put in, is open.
+
+        Raises:
+            NotUnderstood: something is to be put in what was closed before.
+        """
+        shut: set[str] = set()
+        kept = {handle for action in self._meant.forbidden if action.verb == "open" for handle in self._handles(action)}
+        lines: list[str] = []
+        for action in actions:
+            if action.verb in {"open", "close"}:
+                shut = shut - self._handles(action) if action.verb == "open" else shut | self._handles(action)
+            if action.place is None or action.place.relation not in {"in", "to"} or is_table(action.place.thing):
+                continue
+            found = ground(action.place.thing, self._names)
+            handle = handle_of(found.names[0], self._names) if found.is_settled else None
+            if handle in shut:
+                raise NotUnderstood(f"{action.thing} is to be put in {action.place.thing}, which is closed before")
+            if handle in kept:
+                told = f"{found.names[0].text} is closed, and must not be opened"
+                lines.append(f"if not detect({handle!r}).is_open: raise ValueError({told!r})")
+        return lines
+
+    def _handles(self, action: Action) -> set[str]:
+        return {handle.removeprefix("the ") for handle in SubtaskWriter(self._names).operated(action.thing, "handle")}
 
     def _test(self, condition: Condition) -> tuple[list[str], str]:
         """Lines that look, and an expression that is true where the condition holds."""
