@@ -17,9 +17,7 @@ from voxposer.offline.query_writer import SIDES_OF, Locator, is_on
 # Centimetres that the underside of a thing may be off the bounds of what it stands on, or is in: drawers are one above
 # the other.
 _OFF_ON, _OFF_IN = 4, 1.5
-# Centimetres that the middle of its underside may be off the bounds of what it is next to.
-_NEAR = 25
-_LOOKED_AT = frozenset(["on", "in", "top_of", "from", "near"])
+_LOOKED_AT = frozenset(["on", "in", "top_of", "from"])
 RESTS = [
     "cm = np.array([index2cm(1, axis) for axis in 'xyz'])",
     "foot = lambda box: (box[0] + box[1] * np.array([1, 1, 0])) / np.array([2, 2, 1])",
@@ -76,13 +74,7 @@ def _names_in(noun: Noun, names: Sequence[Name]) -> set[str]:
 def _premise(found: Found, noun: Noun, relation: Relation, names: Sequence[Name]) -> str:
     """Lines that check one description; none for relations that are a matter of degree."""
     (ref, *others), several = relation.refs, noun.number or 1
-    if (
-        others
-        or is_table(ref)
-        or ref.plural
-        or (relation.kind == "near" and relation.negated)
-        or relation.kind not in _LOOKED_AT | set(SIDES_OF)
-    ):
+    if others or is_table(ref) or ref.plural or relation.kind not in _LOOKED_AT | set(SIDES_OF):
         return ""
     looked = looked_at(ref, relation, names)
     if looked is None:
@@ -105,5 +97,4 @@ def looked_at(ref: Noun, relation: Relation, names: Sequence[Name]) -> tuple[lis
     if relation.kind in SIDES_OF:
         sign, axis = SIDES_OF[relation.kind]
         return lines, f"detect(name).position[{axis}] {sign} other.position[{axis}]"
-    off = _NEAR if relation.kind == "near" else _OFF_ON if is_on(relation) else _OFF_IN
-    return lines, f"rests(name, other, {off})"
+    return lines, f"rests(name, other, {_OFF_ON if is_on(relation) else _OFF_IN})"
