@@ -45,6 +45,7 @@ class Sentence:
     avoiding: tuple[str, ...] = ()
     slow: bool = False
     refused: tuple[str, ...] = ()
+    so_far: str = "right"
 
     @property
     def half(self) -> str:
