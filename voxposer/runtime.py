@@ -31,7 +31,7 @@ from voxposer.failures import end_with, stop_with
 from voxposer.interface import Interface
 from voxposer.language.llm import Llm
 from voxposer.language.lmp import build_lmps
-from voxposer.language.lmp_config import Call
+from voxposer.language.lmp_config import Call, LmpError
 from voxposer.motions import MotionPlanner
 from voxposer.perception.config import HandState
 from voxposer.perception.view import Perception
@@ -175,7 +175,12 @@ class Runtimes:
             return
         try:
             slot.lmps.set_context((*slot.snapshot.names, *slot.snapshot.parts))
-            slot.progress = replace(slot.progress, subtasks=slot.lmps.plan(instruction))
+            if slot.interface.snapshot is None:
+                self._observe(slot, slot.snapshot)  # a planner's program may look before it plans
+            if slot.cause:
+                return
+            subtasks = _planned(slot, instruction)
+            slot.progress = replace(slot.progress, subtasks=subtasks, first=slot.progress.first or subtasks)
             if not slot.progress.has_next:
                 slot.stop("the planner found nothing to do")
         except Exception as error:
@@ -342,6 +347,20 @@ def _next_index(slot: Slot) -> int:
 def _unfinished(slot: Slot) -> int | None:
     """Index of the subtask of which motions are left to plan, None for none."""
     return slot.progress.cursor - 1 if isinstance(slot.phase, Moving | Pushing) else None
+
+
+def _planned(slot: Slot, instruction: str) -> tuple[str, ...]:
+    """The subtasks of an instruction.
+
+    What it presupposes, "the bowl in the drawer", need not be so any more when it is planned again: where the program
+    raises an error then, or finds nothing to do, the subtasks are those of the first pass.
+    """
+    try:
+        return slot.lmps.plan(instruction) or slot.progress.first
+    except LmpError as error:
+        if error.rule != "raised" or not slot.progress.first:
+            raise
+        return slot.progress.first
 
 
 def _settle(calls: Sequence[Call]) -> None:

@@ -91,6 +91,7 @@ class Progress:
 
     Attributes:
         subtasks: what the planner split the instruction into, latest pass.
+        first: the same of the first pass.
         cursor: index of the next subtask.
         passes: how often the instruction was planned.
         begun: subtasks begun in all passes.
@@ -99,6 +100,7 @@ class Progress:
     """
 
     subtasks: tuple[str, ...] = ()
+    first: tuple[str, ...] = ()
     cursor: int = 0
     passes: int = 0
     begun: int = 0

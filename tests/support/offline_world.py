@@ -37,7 +37,8 @@ class Writer:
             text, finish = _written(json.dumps(messages), tuple(stop), max_tokens)
         except NotUnderstood as error:
             raise NoRuleError(self.config.model, str(error)) from error
-        assert finish == "stop", f"more than {max_tokens} tokens: {text}"
+        if finish != "stop":
+            raise NoRuleError(self.config.model, f"its program has more than {max_tokens} tokens")
         return Reply(text=text, model="writer", finish_reason=finish, prompt_tokens=0, completion_tokens=0, cost_usd=0)
 
 
@@ -190,10 +191,21 @@ class ToyWorld:
                 "hand_offset": lambda: self.voxel(self.ee) - self.voxel(self.ee - self._under()),
                 "normal": lambda: np.array([0.0, 0.0, 1.0]),
                 "axis": lambda: axis,
+                "is_open": lambda: self._is_open(name),
                 "held": lambda: name == self.held,
                 "occupancy_map": lambda: np.zeros((self.size,) * 3),
             }
         )
+
+    def _is_open(self, name: str) -> bool | None:
+        """Whether a part with a joint is open, or switched on."""
+        part = self.snapshot.parts.get(name)
+        if part is None or part.joint is None:
+            return None
+        opened = part.joint.opened
+        if part.kind == "knob":
+            return opened + self.turned.get(name, 0.0) > 0.5 * part.joint.travel
+        return self._drawn("open", f"{_stem(name)}_region")
 
     # -- language ------------------------------------------------------------------------------------------------------
 

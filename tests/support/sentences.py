@@ -1,8 +1,8 @@
-"""The set of sentences in ``tests/data/voxposer_sentences.yaml``, and what the offline writer makes of each.
+"""The two sets of sentences in ``tests/data/``, and what the offline writer makes of each sentence.
 
 A sentence is planned and carried out in ``offline_world``; the relations that hold afterwards are compared with those
-that the file expects. The file's head says what they mean. A fixed rule, the hash of the sentence, puts each sentence
-into the half that the grammar is tuned on or into the one that is only scored.
+that the file expects. The first file's head says what they mean. A fixed rule, the hash of the sentence, puts each
+sentence into the half that the grammar is tuned on or into the one that is only scored.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from support.offline_world import ToyWorld
 from vecenv.observations import ObjectsSnapshot, PointCloud
 from voxposer.language.lmp_config import LmpError
 
-FILE = Path(__file__).parents[1] / "data" / "voxposer_sentences.yaml"
+_DATA = Path(__file__).parents[1] / "data"
+FILES = {"first": _DATA / "voxposer_sentences.yaml", "second": _DATA / "voxposer_sentences_second.yaml"}
 HALVES = ("tuned", "held out")
 # right; refused although there is a plan; refused for another reason; a plan with another outcome; an exception.
 VERDICTS = ("right", "refused", "other reason", "wrong", "crash")
@@ -44,6 +45,7 @@ class Sentence:
     avoiding: tuple[str, ...] = ()
     slow: bool = False
     refused: tuple[str, ...] = ()
+    so_far: str = "right"
 
     @property
     def half(self) -> str:
@@ -64,9 +66,9 @@ class Verdict:
     detail: str = ""
 
 
-def load() -> tuple[Sentence, ...]:
-    """All sentences, in order."""
-    listed = yaml.safe_load(FILE.read_text())["sentences"]
+def load(name: str) -> tuple[Sentence, ...]:
+    """The sentences of a set, in order."""
+    listed = yaml.safe_load(FILES[name].read_text())["sentences"]
     fields: list[dict[str, Any]] = [
         {key: tuple(value) if isinstance(value, list) else value for key, value in one.items()} for one in listed
     ]
@@ -75,8 +77,10 @@ def load() -> tuple[Sentence, ...]:
 
 @functools.cache
 def snapshots() -> Mapping[str, ObjectsSnapshot]:
-    """The scenes by name."""
-    described = yaml.safe_load(FILE.read_text())["scenes"]
+    """The scenes of all sets by name."""
+    described: dict[str, Any] = {}
+    for file in FILES.values():
+        described |= yaml.safe_load(file.read_text())["scenes"]
     found: dict[str, Any] = {name: _boxes(scene["boxes"]) for name, scene in described.items() if "boxes" in scene}
     by_suite: dict[str, list[str]] = collections.defaultdict(list)
     for name, scene in described.items():

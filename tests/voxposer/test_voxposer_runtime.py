@@ -28,6 +28,8 @@ PUSHING = {
     "plate": "ret_val = detect('plate_1')",
     "aside": "volume = get_empty_affordance_map()\nx, y, z = parse_query_obj('plate').position\n"
     "volume[x + 20, y, z] = 1\nret_val = volume",
+    "on the table": "if detect('plate_1').position[2] > 50: raise ValueError('no plate on the table')\n"
+    "composer('look')",
     "nothing": 'composer("look")\ncomposer("lift up")',
     "look": "parse_query_obj('gripper')",
     "nowhere": "x = 1",
@@ -92,6 +94,17 @@ def test_an_instruction_becomes_subtasks_and_errors_are_told_by_slot() -> None:
     assert found.subtask_list[0] == ("lift up", "lift up")
     assert found.subtask_count.tolist() == [2, 0, 0]
     assert found.error == ("", "the planner found nothing to do", "no observation: the slot is not running")
+
+
+def test_what_a_plan_presupposes_is_checked_before_anything_moves_and_only_once() -> None:
+    table, high = runtimes(), snapshot({"plate_1": box((0.07, 0.07, 0.02), (0, 0, 0.4))})
+    (refused,) = table.planner(table.init([high]), ["on the table"]).error
+    assert "no plate on the table" in refused
+    handles, first = opened(table, "on the table", snapshot(PLATE))
+    assert first == (("look",),)
+    table.observe(handles, [high])
+    again = table.planner(handles, ["on the table"])
+    assert (again.subtask_list, again.error) == (first, ("",))
 
 
 def test_a_subtask_becomes_a_trajectory() -> None:

@@ -259,6 +259,9 @@ class Llm:
         except NotUnderstood as error:
             raise NoRuleError(OFFLINE_MODEL, f"{OFFLINE_MODEL} does not understand: {error}") from error
         text, ended = cut(program, [f"\n{token}" for token in request["stop"]], request["max_tokens"])
+        if ended == "length":
+            told = f"its program has more than {request['max_tokens']} tokens; say it in several instructions"
+            raise NoRuleError(OFFLINE_MODEL, f"{OFFLINE_MODEL}: {told}, or raise max_tokens")
         return Reply(
             text=_until(request["stop"], text),
             model=OFFLINE_MODEL,

@@ -2,12 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from voxposer.offline.meaning import Noun
 from voxposer.offline.nouns import Phrase
 
 Group = tuple[Noun | None, list[Phrase]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spoken:
+    """A condition as it was said.
+
+    Attributes:
+        thing: what it is about.
+        state: open, close, on or off; "" for a place.
+        place: where the thing is, for a condition about a place.
+        negated: whether it must not be so.
+    """
+
+    thing: Noun
+    state: str = ""
+    place: Phrase | None = None
+    negated: bool = False
+
+    @property
+    def opposite(self) -> Spoken:
+        """The condition that holds where this one does not."""
+        return replace(self, negated=not self.negated)
 
 
 @dataclass
@@ -24,6 +46,8 @@ class Clause:
         way: where to move it: left, right, front, back.
         ruled_out: phrases after "not": the order says that it is not these.
         said: its words.
+        condition: it is done only where this is so.
+        trails: whether the condition was said behind it.
     """
 
     verb: str
@@ -34,3 +58,5 @@ class Clause:
     way: str = ""
     ruled_out: list[Phrase | Noun] = field(default_factory=list)
     said: str = ""
+    condition: Spoken | None = None
+    trails: bool = False

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from voxposer.offline.clause import Clause
+from voxposer.offline.clause import Clause, Spoken
+from voxposer.offline.conditions import OTHERWISE, read_condition
+from voxposer.offline.corrections import corrected_speech, without_indifference
 from voxposer.offline.lexicon import AFTER, BEFORE, EXCEPTIONS, FILLERS, GERUNDS, POLITE, SPEEDS, THEN, VERBS
 from voxposer.offline.limits import constraint, forbidden, question
 from voxposer.offline.names import NotUnderstood
@@ -26,8 +28,9 @@ def read_clauses(tokens: Sequence[str]) -> tuple[list[Clause], float | None]:
     Raises:
         NotUnderstood: words that are part of no clause; the message quotes them.
     """
-    words, speed = _without_manner(list(tokens))
-    return _Sentence(Cursor(words)).read(), speed
+    said, indifferent = without_indifference(tokens)
+    words, speed = _without_manner(corrected_speech(said))
+    return _Sentence(Cursor(words, indifferent=indifferent)).read(), speed
 
 
 def _without_manner(tokens: list[str]) -> tuple[list[str], float | None]:
@@ -81,6 +84,9 @@ class _Sentence:
         self._cursor = cursor
         self._clauses: list[Clause] = []
         self._after: float | None = None
+        # Where the clauses of the present sentence begin, and the condition that is in force.
+        self._sentence = 0
+        self._condition: Spoken | None = None
 
     def read(self) -> list[Clause]:
         while True:
@@ -96,11 +102,14 @@ class _Sentence:
         first = False
         while True:
             if cursor.take(".", ";", ":"):
-                fresh = True
+                fresh, self._condition, self._sentence = True, None, len(self._clauses)
             elif cursor.take(",", "and", "&") or self._polite():
                 continue
             elif not (order := self._order_word()):
                 return fresh, first
+            elif self._condition is not None:
+                then = f"{' '.join(order)} {cursor.rest}"
+                raise NotUnderstood(f"does the condition hold for {then!r} too? Say it in a sentence of its own")
             else:
                 fresh = True
                 first |= "first" in order and bool(self._clauses)
@@ -126,6 +135,9 @@ class _Sentence:
         """Read a clause, and put it where it belongs in the order."""
         cursor = self._cursor
         last = max((clause.when for clause in self._clauses), default=0.0)
+        if self._begins_condition():
+            self._main(first, last)
+            return
         if self._clauses and cursor.take(
             "before that", "before this", "beforehand", "before doing that", "before doing so"
         ):
@@ -133,6 +145,8 @@ class _Sentence:
             self._clause(self._clauses[-1].when - 0.5)
             return
         if cursor.take(*BEFORE):
+            if self._clauses and self._clauses[-1].forbidden and not fresh:
+                raise NotUnderstood(f"not {self._clauses[-1].said!r} before something else? Say what to do, in order")
             later = self._subordinate(last + 1)
             if fresh:
                 self._separator()
@@ -152,6 +166,22 @@ class _Sentence:
             self._after = before if not leading else None
         else:
             self._main(first, last)
+
+    def _begins_condition(self) -> bool:
+        """Read "if the drawer is open," or "otherwise", which hold up to the end of the sentence."""
+        cursor = self._cursor
+        if cursor.take(*OTHERWISE):
+            before = self._clauses[-1].condition if self._clauses else None
+            if before is None:
+                raise NotUnderstood(f"'otherwise' has no condition before it in {' '.join(cursor.tokens)!r}")
+            self._condition = before.opposite
+        elif (found := read_condition(cursor)) is not None:
+            self._condition = found
+        else:
+            return False
+        cursor.take(",")
+        cursor.take("then")
+        return True
 
     def _starts_order(self) -> bool:
         """Whether an imperative comes next."""
@@ -176,10 +206,27 @@ class _Sentence:
         clause.when, clause.said = when, " ".join(cursor.tokens[start : cursor.at])
         self._clauses.append(clause)
         self._ruled_out(clause)
-        if len(self._clauses) > 1 and cursor.peek() == "first" and at_clause_end(cursor, 1):
+        self._conditioned(clause)
+        if cursor.peek() == "first" and at_clause_end(cursor, 1):
             cursor.next()
-            clause.when = self._clauses[-2].when - 0.5
+            if sum(bool(phrases) for _, phrases in clause.groups) > 1:
+                raise NotUnderstood(f"which part of {clause.said!r} is to be first? Say it as two sentences")
+            clause.when = self._clauses[-2].when - 0.5 if len(self._clauses) > 1 else when
         return clause
+
+    def _conditioned(self, clause: Clause) -> None:
+        """Note the condition of a clause: the one before it, or the one behind it, "..., if it is open"."""
+        cursor, clause.condition = self._cursor, self._condition
+        start = cursor.at
+        cursor.take(",")
+        found = read_condition(cursor)
+        if found is None:
+            cursor.at = start
+        elif clause.condition is not None or len(self._clauses) - self._sentence > 1:
+            raise NotUnderstood(f"which part of {' '.join(cursor.tokens)!r} has the condition? Say it as two sentences")
+        else:
+            clause.condition = found
+            clause.trails = True
 
     def _ruled_out(self, clause: Clause) -> None:
         """ ", not on the left plate", ", but not the top one"."""

@@ -34,7 +34,8 @@ _STOPS = (
             """and or but then not that which who whose except excluding without before after once while when as is are
             was were be been goes go belongs belong of , . ( ) where than so if until unless nor neither besides apart
             other others again at you we i has have had need needs there here ends sits stands lies forward forwards
-            backward backwards alone untouched halfway midway somewhere immediately"""
+            backward backwards alone untouched halfway midway somewhere immediately otherwise else exactly precisely
+            only"""
         )
     )
 )
@@ -110,6 +111,8 @@ def read_determiner(cursor: Cursor) -> Determiner:
             found.number, found.exact = (2, True) if token == "both" else (found.number, found.exact)
         elif token in ARTICLES and not (token == "that" and after in LINKS):
             found.definite, found.said = True, token in {"that", "this", "these", "those"}
+            cursor.next()
+        elif token == "only" and found.definite:
             cursor.next()
         elif token in INDEFINITE:
             found.indefinite = True

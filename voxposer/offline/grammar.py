@@ -10,17 +10,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from voxposer.offline import mentions
 from voxposer.offline.clause import Clause, Group
 from voxposer.offline.clauses import read_clauses
 from voxposer.offline.grounding import ground, is_table
-from voxposer.offline.lexicon import SIDE_WORDS, SIZES, words
-from voxposer.offline.meaning import BESIDE, Action, Avoidance, Instruction, Noun, Place, Ranking, Relation
-from voxposer.offline.names import COLOURS, Name, NotUnderstood, matching, read_names
+from voxposer.offline.meaning import BESIDE, Action, Avoidance, Condition, Instruction, Noun, Place, Ranking, Relation
+from voxposer.offline.mentions import BEARERS, VERBS_SAID, carrying, described_words, inner_nouns
+from voxposer.offline.names import Name, NotUnderstood, matching, read_names
 from voxposer.offline.nouns import PLACES, Phrase, qualified, read_noun_phrase, read_phrase, read_phrases
+from voxposer.offline.spelling import corrected
 from voxposer.offline.tokens import Cursor, tokenize
 
-# Longer texts are no instructions, and cost time.
-_MOST_WORDS = 200
+_MOST_WORDS = 200  # longer texts are no instructions, and cost time
 
 
 def read_instruction(text: str, objects: Sequence[str] = ()) -> tuple[Action, ...]:
@@ -45,10 +46,12 @@ def understand(text: str, objects: Sequence[str] = ()) -> Instruction:
     tokens = tokenize(text)
     if len(tokens) > _MOST_WORDS:
         raise NotUnderstood(f"{' '.join(tokens[:8])!r} ...: an instruction has at most {_MOST_WORDS} words")
+    names = read_names(objects)
+    tokens, slips = corrected(tokens, names)
     clauses, speed = read_clauses(tokens)
     if not clauses:
         raise NotUnderstood(f"no known verb at the beginning of {text.strip()[:80]!r}")
-    return _Reader(read_names(objects)).read(clauses, speed)
+    return replace(_Reader(names).read(clauses, speed), slips=slips)
 
 
 def read_noun(text: str) -> Noun:
@@ -98,6 +101,8 @@ class _Reader:
         self._untouched: list[Noun] = []
         self._kept: list[tuple[str, Noun]] = []
         self._forbidden: list[Action] = []
+        self._condition: Condition | None = None
+        self._picked_if: Condition | None = None
 
     def read(self, clauses: Sequence[Clause], speed: float | None) -> Instruction:
         for clause in clauses:
@@ -118,6 +123,7 @@ class _Reader:
     # -- clauses -------------------------------------------------------------------------------------------------------
 
     def _clause(self, clause: Clause) -> None:
+        self._condition = self._conditioned(clause)
         if clause.forbidden:
             self._forbid(clause)
             return
@@ -132,15 +138,35 @@ class _Reader:
             self._kept += [(verb.removeprefix("keep_"), noun) for noun in self._described(clause.groups)]
         elif verb in {"put", "stack", "push"}:
             self._put(verb, clause)
+        elif verb == "pick" and self._picked and [noun and noun.is_pronoun for noun, _ in clause.groups] == [True]:
+            return  # "hold on to it" adds nothing to what was picked up
         elif verb == "pick":
             self._leave_picked(clause.when)
             self._fixture = self._moved[-1] if self._moved else self._fixture
-            self._picked = self._described(clause.groups)
+            self._picked, self._picked_if = self._described(clause.groups), self._condition
             self._rule_out(clause, self._picked)
         else:
             self._operate(verb, clause)
-        if verb in _VERBS:
+        if verb in VERBS_SAID:
             self._last = (verb, self._last[1])
+
+    def _conditioned(self, clause: Clause) -> Condition | None:
+        """The condition of a clause; what it is about is what "it" stands for in the clause."""
+        spoken = clause.condition
+        if spoken is None:
+            return None
+        if clause.forbidden or clause.verb in {"avoid", "untouched"} or clause.verb.startswith("keep_"):
+            raise NotUnderstood(f"a condition of what not to do is not understood: {clause.said!r}")
+        own = clause.groups[0][0] if clause.trails and clause.groups else None
+        thing = self._thing(own if own is not None and spoken.thing.is_pronoun else spoken.thing)
+        if not clause.trails and (self._condition is None or self._condition.thing != thing):
+            self._mention(thing)
+            self._fixture = thing
+            self._moved = [thing] if spoken.place is not None else self._moved
+        relation = qualified(Noun(words=("thing",)), [spoken.place]).relation if spoken.place is not None else None
+        if relation is not None:
+            relation = replace(relation, refs=tuple(map(self._thing, relation.refs)), negated=False)
+        return Condition(thing=thing, state=spoken.state, relation=relation, negated=spoken.negated)
 
     def _described(self, groups: Sequence[Group]) -> list[Noun]:
         """Objects with all their phrases as their description."""
@@ -181,7 +207,7 @@ class _Reader:
 
     def _leave_picked(self, when: float) -> None:
         """Objects picked up and not put anywhere stay in the hand."""
-        self._actions += [(when, Action(verb="pick", thing=noun)) for noun in self._picked]
+        self._actions += [(when, Action(verb="pick", thing=noun, condition=self._picked_if)) for noun in self._picked]
         self._picked = []
 
     def _rule_out(self, clause: Clause, things: list[Noun]) -> None:
@@ -196,7 +222,7 @@ class _Reader:
     # -- what is meant -------------------------------------------------------------------------------------------------
 
     def _mention(self, noun: Noun) -> None:
-        for part in _inner(noun):
+        for part in inner_nouns(noun):
             if part not in self._mentions[-1:]:
                 self._mentions.append(part)
 
@@ -283,7 +309,7 @@ class _Reader:
         if noun.words[-1] not in {"one", "ones"}:
             return noun
         own = set(noun.words[:-1])
-        heads = [_described_words(mention, own) for mention in mentions if not is_table(mention)]
+        heads = [described_words(mention, own) for mention in mentions if not is_table(mention)]
         heads += [mention.words[-1:] for mention in mentions if not is_table(mention)]
         for head in dict.fromkeys(heads):
             option = replace(noun, words=(*noun.words[:-1], *head))
@@ -309,7 +335,7 @@ class _Reader:
             things = [thing]
             self._rule_out(clause, things)
             self._fixture = thing
-            self._actions.append((clause.when, Action(verb=verb, thing=things[0])))
+            self._actions.append((clause.when, Action(verb=verb, thing=things[0], condition=self._condition)))
 
     # -- putting -------------------------------------------------------------------------------------------------------
 
@@ -323,8 +349,9 @@ class _Reader:
             for thing in self._moving(noun, describing):
                 self._mention(thing)
                 placed.append(self._action(verb, thing, place, clause, placed))
+        placed = mentions.stacked(placed) if verb == "stack" else mentions.together(placed)
         self._check_ruled_out(clause, placed)
-        self._add(placed, verb, clause.when)
+        self._add(placed, clause.when)
 
     def _split(
         self, noun: Noun | None, phrases: Sequence[Phrase], later: Sequence[Group], clause: Clause
@@ -351,7 +378,9 @@ class _Reader:
     def _moving(self, noun: Noun | None, describing: list[Phrase]) -> list[Noun]:
         """The objects to put: the noun's, else those picked up, else those put somewhere before."""
         if noun is not None and not noun.is_pronoun:
-            return [self._resolved(qualified(noun, describing))]
+            thing = self._resolved(qualified(noun, describing))
+            self._picked = [picked for picked in self._picked if picked != thing]
+            return [thing]
         word = noun.words[0] if noun else ""
         if word in {"itself", "themselves", "there", "one", "each other"}:
             raise NotUnderstood(f"{word!r} refers to nothing said before")
@@ -363,6 +392,8 @@ class _Reader:
         if not moving:
             missing = f"{word!r} refers to nothing: " if noun else ""
             raise NotUnderstood(f"{missing}the object to put there is missing")
+        if self._picked and self._picked_if != self._condition:
+            raise NotUnderstood(f"{self._picked[0]} is picked up under a condition, and put somewhere without it")
         self._picked = []
         return list(moving)
 
@@ -372,8 +403,8 @@ class _Reader:
                 raise NotUnderstood(f"how far to the {clause.way} is {thing} to go?")
             return Action(verb="shift", thing=thing, way=clause.way, cm=clause.cm)
         place = self._place(phrase, thing, placed, clause)
-        if place is None and verb == "stack" and thing.plural:
-            return Action(verb="stack", thing=thing)
+        if verb == "stack" and thing.plural:
+            return Action(verb="stack", thing=thing, place=place)
         if place is None:
             raise NotUnderstood(f"the destination of {thing} is missing")
         return Action(verb="push" if verb == "push" else "put", thing=thing, place=place)
@@ -407,25 +438,29 @@ class _Reader:
         if noun is not None and noun.words[0] == "each other":
             return noun
         if noun is None or noun.words[0] in {"it", "that", "this"}:
-            if noun is not None and len(inner := _inner(thing)) > 1:
+            if noun is not None and len(inner := inner_nouns(thing)) > 1:
                 return inner[-2]
             before = placed[-1].place if placed else self._last[1] if clause.verb == "again" else None
             if before is not None and phrase is self._phrase:
                 return before.thing
             last = self._moved_last(placed)
-            bearing = {"on", "top_of", "in"} if last is not None and last.words[-1] in _BEARERS else set()
+            bearing = {"on", "top_of", "in"} if last is not None and last.words[-1] in BEARERS else set()
             where = before.relation if before else self._last[1].relation if self._last[1] else ""
             if (
                 noun is not None
                 and where in bearing
                 and phrase.kind in bearing - ({"top_of"} if where == "in" else set())
             ):
+                if phrase.kind == "in" and last is not None and mentions.is_hollow(last) and where != "in":
+                    return last
                 raise NotUnderstood(f"'{phrase.said} {noun.words[0]}' could be {last} or what it is put on or in")
             if before is not None:
                 return before.thing
             if self._fixture is None and self._mentions[:-1] and noun is not None:
                 return self._mentions[-2]
-        return self._thing(noun if noun is not None else None)
+        if noun is None and self._fixture is None:
+            raise NotUnderstood(f"{phrase.said!r} what? The place for {thing} refers to nothing said before")
+        return self._thing(noun)
 
     def _moved_last(self, placed: Sequence[Action]) -> Noun | None:
         return placed[-1].thing if placed else self._moved[-1] if self._moved else None
@@ -434,63 +469,31 @@ class _Reader:
         """ ", not on the right plate": it must be another place than the one that is said."""
         for out in clause.ruled_out:
             if isinstance(out, Phrase) and out.thing is not None and out.kind in PLACES:
-                noun = self._headed(out.thing, [action.place.thing for action in placed if action.place])
-                if any(
-                    action.place and action.place.thing == noun and out.kind == action.place.relation
-                    for action in placed
-                ):
-                    raise NotUnderstood(f"{clause.said!r} is ruled out by 'not {out.said} {noun}'")
+                places = [action.place for action in placed if action.place]
+                noun = self._headed(out.thing, [place.thing for place in places])
+                unclear = {out.kind, "near"} if out.kind in BESIDE else {out.kind}  # on which side is "next to"?
+                if any(place.relation in unclear and (noun.is_pronoun or place.thing == noun) for place in places):
+                    raise NotUnderstood(f"{clause.said!r} is ruled out by 'not {out.said} {noun}', or may be")
             elif isinstance(out, Noun):
                 things = [action.thing for action in placed]
                 self._rule_out(clause, things)
                 placed[:] = [replace(action, thing=thing) for action, thing in zip(placed, things, strict=True)]
 
-    def _add(self, actions: list[Action], verb: str, when: float) -> None:
+    def _add(self, actions: list[Action], when: float) -> None:
+        actions = [replace(action, condition=self._condition) for action in actions]
         stack, self._put_on = self._put_on, None
-        if stack is not None and stack.place is not None and [action.thing for action in actions] in _carrying(stack):
+        if stack is not None and stack.place is not None and [action.thing for action in actions] in carrying(stack):
             carry = replace(actions[0], thing=stack.place.thing)
             self._actions = [(at, action) for at, action in self._actions if action is not stack]
             actions = [carry, stack]
         elif len(actions) == 1 and actions[0].verb == "put":
             self._put_on = actions[0]
-        del verb
         self._moved = [action.thing for action in actions]
         places = [action.place for action in actions if action.place]
         if places:
             self._last = (self._last[0], places[-1])
             self._fixture = places[-1].thing
         self._actions += [(when, action) for action in actions]
-
-
-_VERBS = frozenset(words("put stack push pick open close turn_on turn_off"))
-
-
-# Things that others can stand in or on.
-_BEARERS = frozenset(
-    words("plate bowl tray basket towel cloth book block cube box ramekin mug cup pan frypan caddy cookie")
-)
-
-
-def _described_words(noun: Noun, own: set[str]) -> tuple[str, ...]:
-    """What "one" repeats of an earlier description: all but its side and size, and its colour where another is said."""
-    dropped = {*SIDE_WORDS, *SIZES, *(COLOURS if own & COLOURS else ())}
-    return tuple(word for word in noun.words if word not in dropped) or noun.words[-1:]
-
-
-def _carrying(stack: Action) -> list[list[Noun]]:
-    """The objects of an action that carries a stack: both of them."""
-    assert stack.place is not None
-    return [[stack.place.thing, stack.thing]]
-
-
-def _inner(noun: Noun) -> list[Noun]:
-    """The objects that a description names, the described one last."""
-    refs: list[Noun] = []
-    if noun.relation is not None:
-        refs += noun.relation.refs
-    if noun.ranking is not None and noun.ranking.ref is not None:
-        refs.append(noun.ranking.ref)
-    return [*(part for ref in refs for part in _inner(ref)), noun]
 
 
 __all__ = ["Noun", "Ranking", "Relation", "read_between", "read_instruction", "read_noun", "understand"]

@@ -18,6 +18,10 @@ TABLE = ("table",)
 _TABLES = frozenset(["table", "tabletop", "desk", "counter", "countertop", "workspace", "floor"])
 # A thing with such a part is a fixture.
 _FIXED_PARTS = frozenset(words("handle knob burner level slot door drawer top"))
+# Objects that "to" puts things into, and those it puts them on; it puts things next to all others.
+CONTAINERS = frozenset(words("basket tray drawer microwave caddy compartment bowl bin box mug"))
+SUPPORTS = frozenset(words("plate stove cabinet shelf rack towel cloth table burner level top ramekin"))
+_HOLLOW = frozenset(words("cup pot pan frypan sink glass jar inside slot"))
 _FIXTURES = frozenset(words("cabinet stove shelf microwave rack sink"))
 _LEVELS = {"top": 0, "upper": 0, "middle": 1, "bottom": 2, "lower": 2}
 
@@ -52,6 +56,12 @@ def is_fixture(name: Name, names: Sequence[Name]) -> bool:
     return name.is_part or bool(parts & _FIXED_PARTS) or bool(_FIXTURES & set(name.words))
 
 
+def holds_things(name: Name, names: Sequence[Name]) -> bool:
+    """Whether "in" it can be a place; "in the plate" is said of what is on it."""
+    parts = {word for other in names if other.whole == name.text for word in other.words}
+    return bool((parts | {*name.words}) & (CONTAINERS | SUPPORTS | _HOLLOW))
+
+
 def ground(noun: Noun, names: Sequence[Name]) -> Found:
     """The names a noun can mean; words like "left" and "big" become its ranking where no name has them.
 
@@ -60,10 +70,17 @@ def ground(noun: Noun, names: Sequence[Name]) -> Found:
     """
     for option in _options(noun):
         found = _generic(option, names) if option.words[-1] in GENERIC else matching(option.words, names)
-        if found:
+        if found and not _is_size_unused(option, found):
             return _checked(_levelled(_without_refs(_without_excluded(Found(option, found), names), names)))
     listed = ", ".join(name.text for name in names) or "no objects"
     raise NotUnderstood(f"{str(noun)!r} fits none of {listed}")
+
+
+def _is_size_unused(noun: Noun, found: Sequence[Name]) -> bool:
+    """Whether a word for a size, which no name has, would tell the names apart: "the small cube"."""
+    sizes = [word for word in noun.words[:-1] if word in SIZES]
+    ranked = noun.ranking is not None and bool(noun.ranking.key)
+    return len(found) > 1 and not ranked and any(word not in name.words for word in sizes for name in found)
 
 
 def _options(noun: Noun) -> list[Noun]:
@@ -131,8 +148,10 @@ def _levelled(found: Found) -> Found:
     """Drawers and levels are told apart by their names: "the second drawer from the top"."""
     ranking, names = found.noun.ranking, found.names
     levels = [[_LEVELS[word] for word in name.part_words if word in _LEVELS] for name in names]
-    if ranking is None or len(names) == 1 or not all(levels) or len({name.whole for name in names}) > 1:
+    if len(names) == 1 or not all(levels) or len({name.whole for name in names}) > 1:
         return found
+    if ranking is None:
+        return _below(found, [level[0] for level in levels])
     if ranking.key in {"left", "right", "front", "back"}:
         listed = ", ".join(name.text for name in names)
         raise NotUnderstood(f"{str(found.noun)!r}: {listed} are above one another")
@@ -146,6 +165,22 @@ def _levelled(found: Found) -> Found:
         return found
     chosen = ordered[ranking.rank - 1 if ranking.rank > 0 else ranking.rank]
     return Found(replace(found.noun, ranking=None), (chosen,))
+
+
+def _below(found: Found, levels: Sequence[int]) -> Found:
+    """ "The drawer below the top one"; positions would not tell it from that one."""
+    noun, relation = found.noun, found.noun.relation
+    if (
+        relation is None
+        or relation.negated
+        or not set(found.names) & set(matching(relation.refs[0].words, found.names))
+    ):
+        return found
+    others = [levels[found.names.index(name)] for name in matching(relation.refs[0].words, found.names)]
+    below = [name for name, level in zip(found.names, levels, strict=True) if level == others[0] + 1]
+    if relation.kind != "under" or len(others) != 1 or not below:
+        raise NotUnderstood(f"{str(noun)!r} is none of {', '.join(name.text for name in found.names)}")
+    return Found(replace(noun, relation=None), tuple(below))
 
 
 def _checked(found: Found) -> Found:
@@ -195,7 +230,36 @@ def holder(relation: str, name: Name, names: Sequence[Name]) -> Name | None:
     return found
 
 
+def handle_of(name: Name, names: Sequence[Name]) -> str | None:
+    """The handle of a drawer, or of a thing with one door; None for what has none."""
+    stem = name.text.removesuffix("_drawer").removesuffix("_inside")
+    return next((other.text for other in names if other.text == f"{stem}_handle"), None)
+
+
 def _part_of(whole: str, names: Sequence[Name], wanted: Sequence[set[str]]) -> Name | None:
     """The first part of a thing with exactly the wanted words, in order of preference."""
     parts = [name for name in names if name.whole == whole and name.is_part]
     return next((part for words in wanted for part in parts if set(part.part_words) == words), None)
+
+
+def with_words(noun: Noun, words: tuple[str, ...], names: Sequence[Name]) -> Noun:
+    """The noun with other words; a name itself stays, so that its own part is found."""
+    whole = [name for name in names if name.text in noun.words]
+    words = tuple(
+        part for word in words for part in ((word.split("_")) if whole and word == whole[0].text else (word,))
+    )
+    return Noun(
+        words=tuple(word for word in words if not word.isdigit()),
+        ranking=noun.ranking,
+        relation=noun.relation,
+        plural=noun.plural,
+        number=noun.number,
+        exact=noun.exact,
+        excluded=tuple(_handle_of(excluded) for excluded in noun.excluded),
+        indefinite=noun.indefinite,
+    )
+
+
+def _handle_of(noun: Noun) -> Noun:
+    words = (*(word for word in noun.words if word not in {"drawer", "door"}), "handle")
+    return Noun(words=words, ranking=noun.ranking, relation=noun.relation)

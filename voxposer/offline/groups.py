@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from voxposer.offline.clause import Group
+from voxposer.offline.determiners import read_length
 from voxposer.offline.lexicon import ARTICLES, GERUNDS, GOES, MODALS, NUMBERS, SIDE_WORDS, SIZES, VERBS, words
+from voxposer.offline.meaning import Noun
 from voxposer.offline.names import COLOURS, NotUnderstood
 from voxposer.offline.nouns import Phrase, read_noun_phrase, read_phrase, read_phrases
 from voxposer.offline.tokens import Cursor
@@ -20,15 +22,25 @@ def read_groups(cursor: Cursor, *, subject: bool = False) -> list[Group]:
     """
     cursor.take("both") if _is_pair(cursor) else None
     found = [_group(cursor)]
-    while _joins(cursor, subject):
+    while _joins(cursor, subject) or _chosen(cursor, found):
         found.append(_group(cursor))
-    _share_head(found)
+    share_head(found)
     if cursor.sees("or", ", or", "and or", "nor"):
         raise NotUnderstood(f"'or' leaves open which: {' '.join(cursor.tokens)!r}")
     return found
 
 
-def _share_head(groups: list[Group]) -> None:
+def _chosen(cursor: Cursor, found: list[Group]) -> bool:
+    """Skip "or ..." where the sentence says that it does not matter which; what is said first is done."""
+    if not (cursor.indifferent and cursor.take(", or", "or")):
+        return False
+    _, phrases = _group(cursor)
+    noun, own = found[-1]
+    found[-1] = (noun, own or phrases)
+    return _joins(cursor, False) or _chosen(cursor, found)
+
+
+def share_head(groups: list[Group]) -> None:
     """ "The left and the right bowl": the noun of the last one is that of those before."""
     for index in range(len(groups) - 2, -1, -1):
         (noun, phrases), (after, later) = groups[index], groups[index + 1]
@@ -58,19 +70,50 @@ def _is_pair(cursor: Cursor) -> bool:
 
 
 def _group(cursor: Cursor) -> Group:
+    cursor.take("only", "just")
     noun = read_noun_phrase(cursor)
     if noun is not None and noun.is_pronoun:
         cursor.take("both", "all", "each")
+    noun = _without_another(cursor, noun)
     if noun is None and cursor.take("neither", "nor"):
         raise NotUnderstood("'neither' is not understood")
-    if not cursor.sees("out of", "over to", "up to"):
+    back = cursor.peek() == "back"
+    if not cursor.sees("out of", "over to", "up to") and not (back and _is_length(cursor)):
         cursor.take("up", "down", "back", "out", "away", "over")
+    cursor.take(*_SO_THAT) if noun is not None else None
     phrases = read_phrases(cursor)
+    if back and not phrases and (cursor.at_end or cursor.peek() in {",", ".", "and", "then"}):
+        raise NotUnderstood(f"'back' to where? Where {noun or 'it'} was before is not remembered")
     if cursor.take("there", "in there", "over there"):
         phrases.append(Phrase(kind="there", said="there"))
     if noun is None and len(phrases) == 1 and cursor.peek() in {"the", "a", "an", "both", "all"}:
         noun = read_noun_phrase(cursor)
     return noun, phrases
+
+
+# "Move the cup so that it is in front of the plate" is "move the cup in front of the plate".
+_SO_THAT = tuple(
+    f"{so} {it}"
+    for so in ("so that", "such that", "so", ", so that", ", such that", ", so")
+    for it in ("it is", "they are", "it stands", "they stand", "it lies", "they lie", "it sits", "it ends up")
+)
+
+
+def _without_another(cursor: Cursor, noun: Noun | None) -> Noun | None:
+    """ "the bowl, not the bottle, on the plate": the other one is not meant."""
+    start = cursor.at
+    cursor.take(",")
+    if noun is not None and not noun.is_pronoun and cursor.take("and not", "but not", "not", "rather than"):
+        other = read_noun_phrase(cursor) if cursor.peek() in ARTICLES else None
+        if other is not None and cursor.take(",") and read_phrase(Cursor(cursor.tokens[cursor.at :])) is not None:
+            return replace(noun, excluded=(*noun.excluded, other))
+    cursor.at = start
+    return noun
+
+
+def _is_length(cursor: Cursor) -> bool:
+    """Whether a length comes after the next token."""
+    return read_length(Cursor(cursor.tokens[cursor.at + 1 :])) is not None
 
 
 def _joins(cursor: Cursor, subject: bool) -> bool:
@@ -93,7 +136,7 @@ _STARTS = frozenset(
     words(
         """then but not without while after before once you please finally next first lastly . avoiding keeping staying
         do never when so i also which who having afterwards later leaving nor stay steer with don't instead if until is
-        are"""
+        are unless otherwise else"""
     )
 ) | {""}
 

@@ -24,13 +24,15 @@ def phrases(text: str) -> frozenset[tuple[str, ...]]:
 # Action -> verbs that mean it, in the base form.
 _VERBS: Mapping[str, str] = {
     "put": """put place set drop deposit move bring transfer lay toss throw stick carry relocate shift insert position
-    return stow store dump load deliver""",
+    return stow store dump load deliver chuck pop plop""",
     "pick": "pick grab grasp lift take get fetch raise seize collect hold",
     "push": "push slide shove nudge",
     "stack": "stack pile",
     "open": "open",
     "close": "close shut",
     "turn": "turn switch",
+    "turn_on": "light ignite activate",
+    "turn_off": "extinguish deactivate",
     "pull": "pull",
     "leave": "leave",
     "keep": "keep",
@@ -93,6 +95,8 @@ STATES: Mapping[str, str] = {
     "closed": "close",
     "shut": "close",
 }
+# Which of several drawers or doors, by its state.
+OPENED: Mapping[str, str] = {"open": "open", "opened": "open", "closed": "closed", "shut": "closed"}
 
 # -- around a sentence -------------------------------------------------------------------------------------------------
 
@@ -100,7 +104,8 @@ STATES: Mapping[str, str] = {
 POLITE = phrases(
     """would you mind|would you be so kind as to|would you be able to|could you be so kind as to
     can you|could you|would you|will you|i want you to|i need you to|i would like you to|i'd like you to|we need you to
-    you should|you must|you need to|you have to|you can|you may|you are to|your task is to|your job is to|please|kindly
+    you should|you must|you need to|you have to|you can|you may|you are to|your task is to|your job is to|please
+    please to|kindly|only|if you can|if possible|if you like|if you please
     make sure to|make sure that you|be sure to|try to|go ahead and|go and|proceed to|start by|begin by|let us|let's
     remember to|hey robot|robot|hey|ok|okay|hi|hello|now|just|simply|so|well|also|help me|help me to|i want to
     i would like to|i'd like to|let me see you|it is time to|it's time to|your goal is to
@@ -113,7 +118,8 @@ FILLERS = phrases(
     """please|kindly|thank you|thanks|for me|again|instead|too|as well|right now|now|right away
     immediately|at once|one after the other|one after another|one by one|one at a time|together|neatly|properly|directly
     if you can|if possible|if you please|will you|would you|could you|can you|this time|completely|fully|all the way
-    afterwards|just|simply|straight|right there|safely|of course
+    afterwards|just|simply|straight|right there|safely|of course|thank you very much|thanks a lot|many thanks
+    thank you so much|mate|buddy|my friend|robot|if you do not mind|if that is ok|if it is possible
     on your own|at the end|while doing so|while doing this|while doing that|in the process|meanwhile|if you would
     if you could"""
 )
@@ -123,10 +129,11 @@ THEN = phrases(
     and next|finally|and finally|lastly|and lastly|last|first|firstly|first of all|second|secondly|thirdly|third
     subsequently|later|and later|to begin with|to start with|once that is done|once done|when that is done
     when you are done|when done|once you are done|in the end|at last|followed by|and also|but|but first|and
-    while you are at it|at the same time"""
+    while you are at it|at the same time|while you|before anything else|before all else|above all|last of all
+    and last of all"""
 )
 BEFORE = ("before", "prior to")
-AFTER = ("after", "once", "as soon as", "when", "having", "after having")
+AFTER = ("after", "once", "as soon as", "when", "having", "after having", "only after", "only once", "only when")
 # Modal verbs and what else stands between a subject and what is to become of it.
 MODALS = phrases(
     """should now|should|must|shall|ought to|needs to|need to|has to|have to|is to|are to|is supposed to
@@ -137,6 +144,17 @@ GOES = frozenset(
 )
 QUESTIONS = frozenset(
     words("is are was were do does did what where which who why how when whose has have am isn't aren't")
+)
+# Said behind alternatives: any of them will do.
+INDIFFERENT = phrases(
+    """i do not care|i do not mind|it does not matter|does not matter|whichever you like|whichever you prefer
+    whichever you want|whichever one you like|as you like|either is fine|either one is fine|any is fine|both are fine
+    up to you|your choice|you choose"""
+)
+# Said where a speaker corrects what was said just before.
+CORRECTIONS = phrases(
+    """sorry|no sorry|oh sorry|no wait|wait no|wait|i mean|no i mean|i meant|no i meant|or rather|make that|no make that
+    correction|no|oh no|actually|no actually|actually no|or actually|scratch that|forget that"""
 )
 NEGATIONS = (
     "do not",
@@ -164,9 +182,9 @@ _PREPOSITIONS: Mapping[str, str] = {
     from the center of|from the middle of|from the centre of""",
     "top_of": "on top of|on the top of|to the top of|to top of|onto the top of|onto top of|atop|on to the top of",
     "left_of": """to the left of|on the left of|at the left of|left of|to left of|to the left side of
-    on the left side of|at the left side of""",
+    on the left side of|at the left side of|left to|left from|to the left from|on the left from""",
     "right_of": """to the right of|on the right of|at the right of|right of|to right of|to the right side of
-    on the right side of|at the right side of""",
+    on the right side of|at the right side of|right from|to the right from|on the right from""",
     "front_of": "in front of|to the front of|at the front of|to front of|on the front of",
     "back_of": "behind|to the back of|at the back of|in back of|at the rear of|to the rear of",
     "near": """next to|adjacent to|close to|near to|beside|alongside|near|nearby|by the side of|by|right next to
@@ -250,3 +268,15 @@ FARTHEST = frozenset(["farthest", "furthest", "farther", "further"])
 # Where an order starts, "the second from the left", and where a superlative leads, "the furthest to the right".
 EXCEPTIONS = ("except for", "except", "apart from", "other than", "excluding", "besides", "but not", "but")
 GENERIC = frozenset(words("object item thing everything anything stuff"))
+
+# Every word that a table has: what a typing error can be one of.
+KNOWN: frozenset[str] = frozenset(
+    [
+        *VERBS, *GERUNDS, *PARTICIPLES, *PARTICLES, *STATES, *GOES, *QUESTIONS, *SPEEDS, *ARTICLES, *INDEFINITE, *ALL,
+        *NUMBERS, *ORDINALS, *UNITS, *SIDE_WORDS, *ORDERS, *SIZES, *NEAREST, *FARTHEST, *GENERIC, *BEFORE, *AFTER,
+        *(f"{word}s" for word in GENERIC),
+        *(word for table in (POLITE, FILLERS, THEN, MODALS, PREPOSITIONS) for phrase in table for word in phrase),
+        *(word for phrase in EXCEPTIONS for word in phrase.split()),
+        *words("both it them they which that who whose and or not without while between other others one ones is are"),
+    ]
+)  # fmt: skip

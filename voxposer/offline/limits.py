@@ -53,6 +53,8 @@ def _touching(cursor: Cursor) -> Clause | None:
         cursor.at = start
         return None
     cursor.take("into", "against", "over", "near to", "near", "close to", "with")
+    if cursor.take(*_REST):
+        return Clause("avoid")
     return Clause("avoid", read_groups(cursor))
 
 
@@ -100,8 +102,18 @@ AS_IT_IS = (
 )  # fmt: skip
 
 
+# What nothing is done with anyway.
+_REST = (
+    "everything else", "anything else", "all else", "all the rest", "the rest", "all the others", "all others",
+    "the others", "all other things", "all other objects", "the other things", "the other objects",
+    "any other thing", "any other object",
+)  # fmt: skip
+
+
 def _left(cursor: Cursor) -> Clause | None:
     """ "the bowls where they are", "it open"."""
+    if cursor.take(*_REST) and cursor.take(*AS_IT_IS):
+        return Clause("untouched")
     noun = read_noun_phrase(cursor)
     if noun is None:
         return None

@@ -139,6 +139,23 @@ class Place:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Condition:
+    """What must be so before anything moves, for an action to be done.
+
+    Attributes:
+        thing: what it is about.
+        state: open, close, on or off; "" where it is about a place.
+        relation: where the thing is.
+        negated: whether it must not be so.
+    """
+
+    thing: Noun
+    state: str = ""
+    relation: Relation | None = None
+    negated: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
 class Action:
     """One action.
 
@@ -148,6 +165,7 @@ class Action:
         place: where to, for put and push.
         way: left, right, front or back, for shift.
         cm: how far, for shift.
+        condition: it is done only where this is so.
     """
 
     verb: str
@@ -155,6 +173,7 @@ class Action:
     place: Place | None = None
     way: str = ""
     cm: float = 0.0
+    condition: Condition | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +195,7 @@ class Instruction:
         untouched: what must not be acted on.
         kept: what must be "open" or "close" in the end, or "on" or "off".
         forbidden: actions that are ruled out.
+        slips: words with typing errors, and what each is taken for.
     """
 
     actions: tuple[Action, ...]
@@ -184,6 +204,7 @@ class Instruction:
     untouched: tuple[Noun, ...] = ()
     kept: tuple[tuple[str, Noun], ...] = ()
     forbidden: tuple[Action, ...] = ()
+    slips: tuple[tuple[str, str], ...] = ()
 
 
 NUMBER_WORDS = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}

@@ -23,6 +23,8 @@ COLOURS = _words("black white red green blue yellow orange brown purple pink gre
 SIDES = _words("left right front back middle top bottom upper lower")
 # Words for parts of an object. Only a phrase with such a word can mean a part.
 PART_WORDS = _words("handle drawer knob button burner compartment section slot level inside door")
+# Words of descriptions that say no object: what a typing error can be one of, besides the words of the scene.
+KINDS = COLOURS | SIDES | PART_WORDS
 # Words for packaging and make; they may be missing from the name.
 _PACKAGES = _words("box can bottle carton pack package packet container jar tin bar")
 _MAKES = _words("wine wooden wood flat desk coffee akita porcelain glazed rim kitchen small big bigger new")
@@ -55,15 +57,15 @@ _SENSES = {
     "bbq": ("barbecue", "bottle", "food"),
     "dressing": ("bottle", "food"),
     "milk": ("carton", "drink", "food"),
-    "juice": ("carton", "drink", "food"),
+    "juice": ("carton", "drink", "food", "oj"),
     "cheese": ("box", "food"),
     "butter": ("box", "food"),
     "pudding": ("box", "dessert", "food"),
     "apple": ("fruit", "food"),
     "orange": ("fruit", "food"),
     "banana": ("fruit", "food"),
-    "carrot": ("vegetable", "food"),
-    "eggplant": ("vegetable", "aubergine", "food"),
+    "carrot": ("vegetable", "veggie", "food"),
+    "eggplant": ("vegetable", "veggie", "aubergine", "food"),
     "coke": ("cola", "drink"),
     "pepsi": ("cola", "drink"),
     "7up": ("drink",),

@@ -17,8 +17,10 @@ from voxposer.offline.lexicon import (
     GERUNDS,
     INDEFINITE,
     NEAREST,
+    OPENED,
     ORDERS,
     ORDINALS,
+    PARTICIPLES,
     PREPOSITIONS,
     SIDE_WORDS,
     STATES,
@@ -29,9 +31,14 @@ from voxposer.offline.meaning import Noun, Ranking, Relation
 from voxposer.offline.names import COLOURS, NotUnderstood, singular
 from voxposer.offline.tokens import Cursor, is_side_end
 
+# What "back" is a particle of the verb before: "put the book back on the shelf".
+_BEFORE_PLACES = frozenset(["", ",", ".", "and", "then", *(phrase[0] for phrase in PREPOSITIONS if phrase[0] != "of")])
 _RELATIVES = ("that", "which", "who")
 _PARTITIVES = frozenset(["piece", "stick", "pat", "slice", "bit", "unit", "item", "kind"])
+# Words before a preposition that change nothing here.
+_NEARLY = ("halfway", "midway", "half way", "exactly", "precisely", "somewhere", "right", "immediately")
 _MODIFIERS = frozenset(["from", "outside", "center", "between"])
+_SIDED = frozenset(words("left_of right_of front_of back_of"))
 PLACES = frozenset(words("on in top_of under near left_of right_of front_of back_of between center to towards"))
 
 
@@ -83,6 +90,8 @@ def read_phrases(cursor: Cursor, *, inner: bool = False) -> list[Phrase]:
 def read_phrase(cursor: Cursor, *, inner: bool = False) -> Phrase | None:
     """The prepositional phrase that comes next, None if there is none."""
     start = cursor.at
+    if cursor.take("side by side"):
+        return Phrase(kind="near", thing=Noun(words=("each other",)), said="side by side")
     negated = cursor.take("not")
     cm = read_length(cursor)
     cursor.take("away", "further", "farther")
@@ -90,7 +99,7 @@ def read_phrase(cursor: Cursor, *, inner: bool = False) -> Phrase | None:
         cursor.take("and")
     said = cursor.rest
     kind = cursor.take_meaning(PREPOSITIONS)
-    if kind is None and cursor.take("halfway", "midway", "half way", "exactly", "somewhere", "right", "immediately"):
+    while kind is None and cursor.take(*_NEARLY):
         said = cursor.rest
         kind = cursor.take_meaning(PREPOSITIONS)
     if kind is None or (cm is not None and kind not in PLACES | {"from"}) or _ends_bare(cursor, kind):
@@ -109,7 +118,21 @@ def read_phrase(cursor: Cursor, *, inner: bool = False) -> Phrase | None:
             raise NotUnderstood("'between' needs two objects")
     if kind == "center" and thing is not None and thing.words[-1] == "workspace":
         thing = Noun(words=("table",))
+    cm = _gap_behind(cursor) if cm is None and kind in _SIDED and thing is not None else cm
     return Phrase(kind=kind, thing=thing, second=second, negated=negated, cm=cm, said=words)
+
+
+def _gap_behind(cursor: Cursor) -> float | None:
+    """ "to the left of the plate, 5 cm away from it", "... with a gap of 5 cm"."""
+    start = cursor.at
+    cursor.take(",")
+    gap = cursor.take("with a gap of", "at a distance of", "with a distance of", "leaving a gap of", "leaving")
+    cm = read_length(cursor)
+    if cm is not None and (cursor.take("away", "apart", "from it", "of space", "between them") or gap):
+        cursor.take("from it", "from that", "between them", "in between")
+        return cm
+    cursor.at = start
+    return None
 
 
 def _bare_side(cursor: Cursor) -> str:
@@ -177,7 +200,7 @@ def _noun(
         words=tuple(map(singular, words)),
         ranking=ranking,
         plural=many and not single,
-        indefinite=found.indefinite or single,
+        indefinite=(found.indefinite and not (many and found.number)) or single,
         number=number,
         exact=exact,
         excluded=tuple(Noun(words=(word,)) for word in excluded),
@@ -230,8 +253,14 @@ def _ends_words(cursor: Cursor, last: str) -> bool:
         last in {"it", "them", "itself", "there", "they"}
         or (token in STATES and not is_word(after))
         or (token in SIDE_WORDS and after == "of")
+        or (token in {"left", "right"} and after == "from")
+        or (token == "left" and after == "to")
+        or (token == "right" and after in _BEFORE_PLACES - {"", ",", ".", "and", "then", "to"})
         or _starts_length(cursor)
         or (token in {"can", "will", "may", "might", "could"} and after in {"be", "go", "not"})
+        or (token == "back" and after in _BEFORE_PLACES)
+        or (token == "side" and after == "by")
+        or (token in PARTICIPLES and token not in SIDE_WORDS and after in _BEFORE_PLACES - {"", ",", "."})
         or (token in ORDINALS and after in {"", ",", ".", "and", "then"})
         or token in GERUNDS
         or _is_verb(cursor)
@@ -280,7 +309,9 @@ def _relative(cursor: Cursor, noun: Noun) -> Noun | None:
         return None
     cursor.take("located", "placed", "standing", "lying", "sitting", "currently", "the one")
     negated = cursor.take("not")
-    if negated:
+    if negated and cursor.peek() in OPENED and not is_word(cursor.peek(1)):
+        changed = replace(noun, words=("closed" if OPENED[cursor.next()] == "open" else "open", *noun.words))
+    elif negated:
         changed = _excluding(cursor, noun)
     else:
         changed = _side(cursor, noun) or _distance(cursor, noun) or _adjective(cursor, noun)
@@ -302,6 +333,8 @@ def _adjective(cursor: Cursor, noun: Noun) -> Noun | None:
         return replace(noun, ranking=Ranking(key=ORDERS[cursor.next()]))
     if cursor.peek() in COLOURS:
         return replace(noun, words=(cursor.next(), *noun.words))
+    if cursor.peek() in OPENED and not is_word(cursor.peek(1)):
+        return replace(noun, words=(OPENED[cursor.next()], *noun.words))
     cursor.at = start
     return None
 
@@ -340,7 +373,10 @@ def _ranked_from(cursor: Cursor, noun: Noun) -> Noun | None:
 def _side(cursor: Cursor, noun: Noun) -> Noun | None:
     """ "on the left": the side that tells one of several."""
     start = cursor.at
-    hand = cursor.take("on the", "at the", "in the", "from the", "on your", "on my")
+    hand = cursor.take("on the", "at the", "in the", "from the", "on your", "on my") or cursor.sees(
+        "in front", "in back"
+    )
+    cursor.take("in") if cursor.peek(1) in {"front", "back"} else None
     cursor.take("far", "very", "left hand", "right hand") if hand else None
     side = SIDE_WORDS.get(cursor.peek()) if hand else None
     if side is None:

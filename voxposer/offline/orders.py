@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from voxposer.offline.clause import Clause, Group
 from voxposer.offline.determiners import read_length
-from voxposer.offline.groups import read_groups
+from voxposer.offline.groups import read_groups, share_head
 from voxposer.offline.lexicon import GERUNDS, PARTICIPLES, STATES, VERBS
+from voxposer.offline.meaning import Noun
 from voxposer.offline.names import NotUnderstood
-from voxposer.offline.nouns import read_phrase
+from voxposer.offline.nouns import Phrase, read_noun_phrase, read_phrase, read_phrases
 from voxposer.offline.tokens import Cursor
 
 _SAME = tuple(
@@ -60,11 +62,57 @@ def _verb_phrase(cursor: Cursor, base: str) -> Clause:
     particle = cursor.take_any(
         {"up", "down", "over", "out", "away", "back"} - ({"back"} if _is_noun_next(cursor) else set())
     )
+    cursor.take("on to", "onto") if base == "hold" else None
+    if cursor.peek() == "and" and cursor.peek(1) in VERBS and (shared := _shared(cursor, action, state)) is not None:
+        return shared
     moved = read_shift(cursor)
-    groups = read_groups(cursor)
+    groups, out = _not_but(cursor) if cursor.peek() in {"neither", "not"} else (read_groups(cursor), [])
     state = state or take_state(cursor, switched=switched)
     cursor.take("up", "down", "back")
-    return meant(cursor, action, groups, state, particle, moved)
+    clause = meant(cursor, action, groups, state, particle, moved)
+    clause.ruled_out += out
+    return clause
+
+
+def _shared(cursor: Cursor, action: str, state: str) -> Clause | None:
+    """ "Open and close the drawer", "pick up and place the bowl on the plate": the object stands behind both verbs."""
+    start = cursor.at
+    cursor.next()
+    clause = imperative(False)(cursor)
+    if clause is None or not clause.groups or clause.groups[0][0] is None or clause.groups[0][0].is_pronoun:
+        cursor.at = start
+        return None
+    if action == "pick" and clause.verb == "put":
+        return clause
+    cursor.at = start
+    if action not in {"open", "close"} or clause.verb not in {"open", "close"} or state:
+        return None
+    return Clause(action, [(noun, list(phrases)) for noun, phrases in clause.groups])
+
+
+def _not_but(cursor: Cursor) -> tuple[list[Group], list[Phrase | Noun]]:
+    """ "neither the milk nor the butter in the basket, only the soup", "not the left one but the right one"."""
+    start = cursor.at
+    cursor.next()
+    out: list[Group] = []
+    while not out or cursor.take("nor", ", nor", "or", "and"):
+        noun = read_noun_phrase(cursor)
+        if noun is None:
+            raise NotUnderstood(f"what must not be in {' '.join(cursor.tokens[start:])!r}?")
+        out.append((noun, []))
+    share_head(out)
+    phrases = read_phrases(cursor)
+    cursor.take(",")
+    if not cursor.take("but only", "but just", "but rather", "but", "only", "just"):
+        raise NotUnderstood(f"{' '.join(cursor.tokens[start:])!r} says only what not to do")
+    groups = read_groups(cursor)
+    last, head = groups[-1], out[-1][0]
+    assert head is not None
+    for index, (noun, own) in enumerate(groups):
+        if noun is not None and noun.words[-1] == "one":
+            groups[index] = (replace(noun, words=(*noun.words[:-1], head.words[-1])), own)
+    groups[-1] = (groups[-1][0], last[1] or phrases)
+    return groups, [noun for noun, _ in out if noun is not None]
 
 
 def _is_noun_next(cursor: Cursor) -> bool:
@@ -92,6 +140,9 @@ def read_shift(cursor: Cursor) -> tuple[str, float] | None:
     """ "10 cm to the left" with no object behind it."""
     start = cursor.at
     cm = read_length(cursor)
+    if cm is None and cursor.peek() in _WAYS and _has_length(cursor, 1):
+        way = _WAYS[cursor.next()]
+        return way, read_length(cursor) or 0.0
     if cm is None and not cursor.sees("to the", "towards the", "forward", "forwards", "backward", "backwards"):
         return None
     cursor.take("further", "more")
@@ -104,6 +155,11 @@ def read_shift(cursor: Cursor) -> tuple[str, float] | None:
         return way, cm or 0.0
     cursor.at = start
     return None
+
+
+def _has_length(cursor: Cursor, ahead: int) -> bool:
+    """Whether a length comes after some more tokens."""
+    return read_length(Cursor(cursor.tokens[cursor.at + ahead :])) is not None
 
 
 def at_clause_end(cursor: Cursor, ahead: int) -> bool:
@@ -121,6 +177,8 @@ def meant(
         moved = read_shift(cursor)
     if action == "turn":
         return _turned(groups, state)
+    if action in {"turn_on", "turn_off"}:
+        return Clause(action, groups)
     if action in {"push", "pull", "close", "open"} and state in {"open", "close"}:
         return Clause(state, groups)
     if action in {"open", "close"}:
@@ -141,8 +199,8 @@ def meant(
 def _turned(groups: list[Group], state: str) -> Clause:
     """ "Turn X on", where "on" was read as a preposition without an object, or "turn on X"."""
     noun, phrases = groups[-1]
-    if not state and phrases and phrases[-1].said == "on" and phrases[-1].thing is None:
-        state, groups[-1] = "on", (noun, phrases[:-1])
+    if not state and phrases and phrases[-1].said in {"on", "off"} and phrases[-1].thing is None:
+        state, groups[-1] = phrases[-1].said, (noun, phrases[:-1])
     if state not in {"on", "off"}:
         raise NotUnderstood("turn it on or off? 'turn' alone is not understood")
     return Clause(f"turn_{state}", groups)

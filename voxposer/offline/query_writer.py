@@ -35,11 +35,11 @@ _VALUES = {
     "long": (False, "np.max((thing.aabb[1] - thing.aabb[0]) * cm)"),
 }
 _CONTAINERS = frozenset(["drawer", "compartment", "inside", "basket", "tray", "microwave", "caddy"])
-_BESIDE = {"left_of": ("<", 1), "right_of": (">", 1), "back_of": ("<", 0), "front_of": (">", 0)}
+SIDES_OF = {"left_of": ("<", 1), "right_of": (">", 1), "back_of": ("<", 0), "front_of": (">", 0)}
 # Relations that do not depend on height: they also hold for a lifted object.
 _FLAT = frozenset(["near", "between", "center", "outside"])
 # Voxels are not cubes: centimetres of one along each axis.
-_SCALE = "cm = np.array([index2cm(1, 'x'), index2cm(1, 'y'), index2cm(1, 'z')])"
+SCALE = "cm = np.array([index2cm(1, 'x'), index2cm(1, 'y'), index2cm(1, 'z')])"
 
 
 def write_query(query: str, objects: Sequence[str]) -> str:
@@ -55,13 +55,13 @@ def write_query(query: str, objects: Sequence[str]) -> str:
         if bare in known and not any(name.text.lower() == bare for name in names):
             return f"ret_val = detect({alias!r})"
     try:
-        lines, found = _Locator(names).locate(read_noun(text))
+        lines, found = Locator(names).locate(read_noun(text))
     except RecursionError:
         raise NotUnderstood(f"{text[:80]!r} describes objects by one another without an end") from None
     return "\n".join([*lines, f"ret_val = {found}"])
 
 
-class _Locator:
+class Locator:
     """Writes the lines that find a noun and the objects that describe it."""
 
     def __init__(self, names: Sequence[Name]) -> None:
@@ -71,7 +71,10 @@ class _Locator:
             "cm",
             "distances",
             "face",
+            "name",
             "objects",
+            "other",
+            "rests",
             "np",
             "i",
             "foot",
@@ -116,7 +119,7 @@ class _Locator:
     def _scale(self) -> list[str]:
         """The line that says how large voxels are, the first time it is needed."""
         needed, self._scaled = not self._scaled, True
-        return [_SCALE] if needed else []
+        return [SCALE] if needed else []
 
     def _choose(self, found: Found, several: str) -> tuple[list[str], str]:
         noun = found.noun
@@ -130,7 +133,7 @@ class _Locator:
         for ref in refs_of(noun):
             if not is_table(ref) and _could_be(ground(ref, self._names), found):
                 lines += self._without(replace(ref, plural=False), several)
-        if noun.relation and noun.ranking and noun.relation.kind not in _BESIDE:
+        if noun.relation and noun.ranking and noun.relation.kind not in SIDES_OF:
             raise NotUnderstood(f"{str(noun)!r} says both an order and a place; say one")
         if noun.relation and noun.ranking:
             more, several = self._beyond(noun.relation, several)
@@ -178,7 +181,7 @@ class _Locator:
         return [*lines, f"{name} = {expression}", f"{several} = {kept}"]
 
     def _by_relation(self, relation: Relation, several: str) -> tuple[list[str], str]:
-        if relation.kind in _BESIDE:
+        if relation.kind in SIDES_OF:
             return self._beside(relation, several)
         away = relation.negated != (relation.kind == "outside")
         if relation.kind == "between" and len(relation.refs) == 2:
@@ -186,7 +189,7 @@ class _Locator:
             lines += [*self._scale(), *_from_line(several, *ends)]
             return lines, f"{several}[np.{'argmax' if away else 'argmin'}(distances)]"
         lines, goal = self._goal(relation)
-        if _is_on(relation):
+        if is_on(relation):
             lines += [*self._scale(), *_gaps(several, goal.removesuffix(".position"))]
         else:
             lines += [*self._scale(), _distances(several, goal, flat=relation.kind in _FLAT)]
@@ -225,7 +228,7 @@ class _Locator:
         return self._filtered(relation, several, lines, goal)
 
     def _filtered(self, relation: Relation, several: str, lines: list[str], goal: str) -> tuple[list[str], str]:
-        sign, axis = _BESIDE[relation.kind]
+        sign, axis = SIDES_OF[relation.kind]
         condition = f"thing.position[{axis}] {sign} {goal}[{axis}]"
         chosen = f"[thing for thing in {several} if {'not ' if relation.negated else ''}{condition}]"
         candidates = self._name("candidates")
@@ -245,9 +248,10 @@ def _at(values: str, least: bool, rank: int) -> str:
     return f"np.argsort({values})[{place}]"
 
 
-def _is_on(relation: Relation) -> bool:
+def is_on(relation: Relation) -> bool:
     """Whether the phrase says that an object stands on another; "from" a container means that it was in it."""
-    inside = relation.kind == "from" and bool(_CONTAINERS.intersection(relation.refs[0].words))
+    said = {part for word in relation.refs[0].words for part in word.split("_")}
+    inside = relation.kind == "from" and bool(_CONTAINERS & said)
     return relation.kind in {"on", "top_of", "from"} and not inside
 
 

@@ -53,6 +53,11 @@ class Moves:
             noun: the description.
             place: where they go, by which those that were moved already are told from the others.
         """
+        counted = noun.words[-1] in GENERIC and noun.number is not None and not (noun.ranking or noun.relation)
+        if counted and place is not None and not is_table(place.thing):
+            # "Two things" are two besides the one that they are put on.
+            there = [Noun(words=(name.text,)) for name in ground(place.thing, self._names).names]
+            noun = replace(noun, excluded=(*noun.excluded, *there))
         found = ground(noun, self._names)
         self._check_refs(found.noun)
         if found.noun.words[-1] in GENERIC and place is not None:

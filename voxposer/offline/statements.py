@@ -9,8 +9,8 @@ from voxposer.offline.groups import read_groups
 from voxposer.offline.lexicon import GOES, MODALS, PARTICIPLES, STATES, VERBS
 from voxposer.offline.limits import AS_IT_IS
 from voxposer.offline.names import NotUnderstood
-from voxposer.offline.nouns import read_phrases
-from voxposer.offline.orders import at_clause_end, meant, read_shift, take_state
+from voxposer.offline.nouns import qualified, read_phrases
+from voxposer.offline.orders import at_clause_end, imperative, meant, read_shift, take_state
 from voxposer.offline.tokens import Cursor
 
 
@@ -42,6 +42,8 @@ def statement(past: bool) -> Callable[[Cursor], Clause | None]:
         groups = read_groups(cursor, subject=True)
         if not groups or groups[0][0] is None:
             return None
+        if cursor.peek() == "," and cursor.peek(1) in VERBS:
+            return _named_first(cursor, groups)
         ordered = bool(_modals(cursor)) or cursor.tokens[max(start - 1, 0)] in _ASSURED
         linked = cursor.take_any(_LINKS) != ""
         while cursor.take_any(_LINKS):
@@ -53,7 +55,9 @@ def statement(past: bool) -> Callable[[Cursor], Clause | None]:
             return predicate(cursor, groups)
         if not (ordered or linked):
             return None
-        done = past and cursor.peek() in PARTICIPLES
+        # "When the pot is on the stove" may be a condition.
+        placed = cursor.sees(*_WHERE) and cursor.tokens[max(start - 1, 0)] != "when"
+        done = past and (cursor.peek() in PARTICIPLES or placed)
         if not (ordered or done or cursor.sees("to be", "not to be", "to go")):
             raise NotUnderstood(f"{' '.join(cursor.tokens[start:])!r} says what is, not what to do")
         return predicate(cursor, groups)
@@ -61,6 +65,23 @@ def statement(past: bool) -> Callable[[Cursor], Clause | None]:
     return read
 
 
+def _named_first(cursor: Cursor, groups: list[Group]) -> Clause | None:
+    """ "The milk, put it in the basket": the pronoun is the object that was named first."""
+    cursor.next()
+    clause = imperative(False)(cursor)
+    if clause is None or not clause.groups:
+        return None
+    pronoun, phrases = clause.groups[0]
+    if pronoun is None or pronoun.words not in {("it",), ("them",), ("they",)} or not pronoun.is_pronoun:
+        return None
+    things: list[Group] = [(noun and qualified(noun, described), []) for noun, described in groups]
+    things[-1] = (things[-1][0], phrases)
+    clause.groups[:1] = things
+    return clause
+
+
+# What begins a place: "once the pot is (standing) on the stove" is an order to put it there.
+_WHERE = ("standing", "lying", "sitting", "on", "in", "inside", "next to", "beside", "behind", "between", "under")
 _LINKS = frozenset(["has", "have", "is", "are", "gets", "get", "was", "were", "been", "being"])
 # The last words of "make sure that", "see to it that" and the like.
 _ASSURED = frozenset(["sure", "that"])
@@ -125,10 +146,12 @@ def predicate(cursor: Cursor, groups: list[Group]) -> Clause | None:
         state = STATES[word]
         clause = Clause(f"turn_{state}" if state in {"on", "off"} else state, groups)
     else:
-        cursor.take("somewhere", "placed")
+        cursor.take("somewhere", "placed", "standing", "lying", "sitting")
         phrases = read_phrases(cursor)
         if not phrases:
             return None
+        if negated and cursor.take(", but rather", ", but", "but rather", "but") and (instead := read_phrases(cursor)):
+            negated, phrases = False, instead
         groups[-1] = (groups[-1][0], [*groups[-1][1], *phrases])
         clause = Clause("put", groups)
     clause.forbidden = negated

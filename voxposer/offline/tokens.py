@@ -31,6 +31,7 @@ _SPELLINGS = (
     (r"\b(i|we|you)'d like\b", r"\1 would like"),
     (r"\b(is|are|was|were|does|do|should|must|need)n'?t\b", r"\1 not"),
     (r"\b(?:cannot|can't)\b", "can not"),
+    (r"\blet's\b", "let us"),
     (r"\bwon't\b", "will not"),
     (r"\b(\w+)'s (left|right|front|back|rear)(?: hand)?(?: side)?(?=\s*(?:$|[.,;!?]|and\b|then\b))", r"\2 of the \1"),
     (
@@ -41,6 +42,7 @@ _SPELLINGS = (
     (r"\bfrying pan(s?)\b", r"frypan\1"),
     (r"\b(?:layer|level) of (?:the )?drawers?\b", "drawer"),
     (r"\b(?:the )?table (?:center|centre|middle)\b", "the center of the table"),
+    (r"\b(?:whichever|whatever) ((?:[a-z]+ ){1,3}?)(is|are)\b", r"the \1that \2"),
     (r"&", " and "),
 )
 
@@ -59,10 +61,11 @@ class Cursor:
 
     Attributes:
         at: index of the next token.
+        indifferent: whether it was said that of alternatives ("or") any will do.
     """
 
-    def __init__(self, tokens: Iterable[str]) -> None:
-        self.tokens, self.at = list(tokens), 0
+    def __init__(self, tokens: Iterable[str], *, indifferent: bool = False) -> None:
+        self.tokens, self.at, self.indifferent = list(tokens), 0, indifferent
 
     @property
     def at_end(self) -> bool:
