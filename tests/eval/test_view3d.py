@@ -277,10 +277,10 @@ def test_options_that_cannot_be_had_are_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], options: list[str], status: int, text: str
 ) -> None:
     import typer
-    from vecenv_eval.cli import serve
+    from vecenv_eval.cli import listening, serve
 
-    installed = serve.is_installed
-    monkeypatch.setattr(serve, "is_installed", lambda module: module != "viser" and installed(module))
+    installed = listening.is_installed
+    monkeypatch.setattr(listening, "is_installed", lambda module: module != "viser" and installed(module))
     app = typer.Typer()
     app.command()(serve.serve_command)
     with pytest.raises(SystemExit) as ended:
