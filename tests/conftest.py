@@ -30,13 +30,36 @@ settings.register_profile("vecenv", deadline=None)
 settings.load_profile("vecenv")
 
 REPOSITORY = Path(__file__).parent.parent
+# Bytes of compiled JAX programs; a run makes a tenth of it.
+LARGEST_CACHE = 2 * 2**30
+# Files of half a minute and more of CPU time.
+LONGEST = (
+    "libero/physics/test_mjx.py",
+    "libero/functional/test_functional.py",
+    "libero/physics/test_deterministic.py",
+    "interop/test_playground.py",
+    "libero/render/test_raytrace.py",
+    "libero/render/test_rays.py",
+    "libero/physics/test_mjx_contacts.py",
+    "test_examples.py",
+    "eval/test_verdict_identity.py",
+)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Compiled scenes go to a folder of this run, not to the user's cache. Warp's kernels take minutes and do not."""
+    """What is compiled goes to a folder of this run, not to the user's cache. Warp's kernels take minutes and do not.
+
+    The processes of a run share the folder. JAX locks its part of it only where that has a largest size.
+    """
+    run = tmp_path_factory.getbasetemp()
+    folder = (run.parent if "PYTEST_XDIST_WORKER" in os.environ else run) / "vecenv-cache"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("VECENV_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("VECENV_CACHE_DIR", str(folder))
+        patch.setenv("JAX_COMPILATION_CACHE_MAX_SIZE", str(LARGEST_CACHE))
+        jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
+        jax.config.update("jax_compilation_cache_max_size", LARGEST_CACHE)
+        jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
         if "WARP_CACHE_PATH" not in os.environ:
             patch.setenv("WARP_CACHE_PATH", str(platformdirs.user_cache_path("warp")))
         yield
@@ -80,5 +103,6 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that fork come first, while the process that runs them is small."""
-    items.sort(key=lambda item: item.get_closest_marker("forks") is None)
+    """Files that take longest come first, so that the processes that share the files end together."""
+    place = {REPOSITORY / "tests" / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
