@@ -11,7 +11,7 @@ import jaxtyping
 import platformdirs
 import pytest
 from hypothesis import settings
-from support import checker
+from support import checker, memory
 
 # Tests check the shapes and types in the signatures of these modules, which must not have been imported yet. Left out
 # are modules that numba compiles, and dataclasses that JAX fills with things other than arrays while it traces.
@@ -28,6 +28,8 @@ jaxtyping.install_import_hook(_CHECKED, f"{checker.__name__}.{checker.check.__na
 # How long an example takes says something about the machine, nothing about the code.
 settings.register_profile("vecenv", deadline=None)
 settings.load_profile("vecenv")
+
+memory.map_large_allocations()
 
 REPOSITORY = Path(__file__).parent.parent
 # Bytes of compiled JAX programs; a run makes a tenth of it.
@@ -63,6 +65,13 @@ def _cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None
         if "WARP_CACHE_PATH" not in os.environ:
             patch.setenv("WARP_CACHE_PATH", str(platformdirs.user_cache_path("warp")))
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _memory_is_given_back() -> Iterator[None]:
+    """A process does not keep what the files before have compiled and freed."""
+    yield
+    memory.give_back()
 
 
 @pytest.fixture(scope="module")
