@@ -81,6 +81,14 @@ def no_rank_promotion() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def quick_compilation() -> Iterator[None]:
+    """JAX's programs are not optimised: for files whose programs take longer to compile than to run."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture
 def unchecked_shapes() -> Iterator[None]:
     """Signatures are not checked, as outside of tests: a wrong shape reaches the function, whose own error counts."""

@@ -24,6 +24,8 @@ from vecenv.libero.physics.mjx.step import fault_text
 
 pytest.importorskip("warp", reason="MuJoCo Warp is an extra: pip install 'vecenv[warp]'")
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 SLOTS = 3
 # Ticks of most calls: a call of another length is another program, which takes longer to compile than to run.
 TICKS = 3
