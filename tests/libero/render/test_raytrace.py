@@ -38,7 +38,6 @@ from vecenv.libero.tasks.suites import list_tasks
 from vecenv.observations import Egocentric
 
 pytest.importorskip("warp")
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 # What the project promises of each image, and of the masks of each instance.
 LEAST_PSNR, LEAST_IOU = 24.0, 0.97
