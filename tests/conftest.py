@@ -32,9 +32,9 @@ settings.load_profile("vecenv")
 memory.map_large_allocations()
 
 REPOSITORY = Path(__file__).parent.parent
-# Bytes of compiled JAX programs; a run makes a tenth of it.
+# Bytes of compiled JAX programs that are kept; those used longest ago are dropped first.
 LARGEST_CACHE = 2 * 2**30
-# Files of half a minute and more of CPU time.
+# Files that take long.
 LONGEST = (
     "libero/physics/test_mjx.py",
     "libero/functional/test_functional.py",
