@@ -22,8 +22,6 @@ from vecenv_eval.store import ResultStore
 
 from vecenv.cli import build_app, main
 
-pytestmark = pytest.mark.forks
-
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 

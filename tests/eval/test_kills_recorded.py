@@ -19,10 +19,7 @@ from vecenv_eval.store import ResultStore
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 # What pyarrow and other libraries start are threads of their own, which a fork does not use.
-pytestmark = [
-    pytest.mark.forks,
-    pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 EVERY = {Episode(world.SUITE, task, episode) for task in (0, 1) for episode in range(5)}
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 import httpx
+import numpy as np
 import pytest
 from support import streams
 from support.live_world import LiveWorld, config, session
@@ -169,7 +170,9 @@ def raw_reader(server: Server, received: int = 4096) -> socket.socket:
     return connection
 
 
-def test_a_reader_that_reads_nothing_holds_up_nobody_and_is_disconnected(live: Session) -> None:
+def test_a_reader_that_reads_nothing_holds_up_nobody_and_is_disconnected(world: LiveWorld, live: Session) -> None:
+    # Large images soon fill what the system keeps for a connection that is not read, which is megabytes.
+    world.last.noise = np.random.default_rng(0).integers(0, 256, (256, 256, 3), np.uint8)
     with running(create_app(live, ServeSettings(send_timeout_s=1.0))) as server:
         slow = [raw_reader(server) for _ in range(5)]
         with streams.opened(server) as stream:

@@ -1,6 +1,6 @@
 """A small world for live sessions: the fake environment with ticks that can be watched and images that can be drawn.
 
-An image of a slot is of one colour, which tells slot and tick apart.
+An image of a slot is of one colour, which tells slot and tick apart, or noise, of which JPEG files are large.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ class LiveEnv(FakeEnv):
         self.watchers: list[Watcher] = []
         self.drawn: list[tuple[int, str]] = []
         self.broken: Exception | None = None
+        self.noise: np.ndarray | None = None
 
     @contextmanager
     def watched(self, watcher: Watcher) -> Iterator[None]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -55,6 +56,8 @@ class LiveEnv(FakeEnv):
         if self.broken:
             raise self.broken
         self.drawn += [(slot, name) for slot in slots for name in names]
+        if self.noise is not None:
+            return dict.fromkeys(names, np.broadcast_to(self.noise, (self.num_envs, *self.noise.shape)))
         images = np.zeros((self.num_envs, SIDE, SIDE, 3), np.uint8)
         for slot in slots:
             images[slot] = color(slot, int(self.ticks[slot]))

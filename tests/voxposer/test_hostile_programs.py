@@ -13,10 +13,7 @@ from support.hostile_programs import HEAVY, HOSTILE
 from voxposer.sandbox.guard import Limits
 from voxposer.sandbox.syntax import RULES
 
-pytestmark = [
-    pytest.mark.forks,
-    pytest.mark.skipif(sys.platform != "linux", reason="reads the memory of a process as Linux shows it"),
-]
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads the memory of a process as Linux shows it")
 
 # Small, so that two thousand programs take seconds; what a program may take beyond its limits is the same with any.
 SMALL = Limits(steps=20_000, calls=100, memory_bytes=256 * 2**20, seconds=0.5)

@@ -24,7 +24,11 @@ from vecenv.libero.physics.mjx.step import fault_text
 
 pytest.importorskip("warp", reason="MuJoCo Warp is an extra: pip install 'vecenv[warp]'")
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 SLOTS = 3
+# Ticks of most calls: a call of another length is another program, which takes longer to compile than to run.
+TICKS = 3
 
 
 def libero(backend: str, task: int = 0, episodes: int = SLOTS, **options: Any) -> LiberoEnv:
@@ -58,19 +62,19 @@ def both(warp: LiberoEnv, native: LiberoEnv) -> tuple[LiberoEnv, LiberoEnv]:
     return warp, native
 
 
-def chunk(ticks: int) -> np.ndarray:
+def chunk(ticks: int = TICKS) -> np.ndarray:
     """Actions that keep the hand in free space."""
     half = np.random.default_rng(0).uniform(-0.5, 0.5, (SLOTS, ticks, 7))
     half[..., 2] = np.abs(half[..., 2])
     return half
 
 
-def test_it_speaks_every_verb() -> None:
-    assert isinstance(libero("warp"), BatchEnv)
+def test_it_speaks_every_verb(warp: LiberoEnv) -> None:
+    assert isinstance(warp, BatchEnv)
 
 
 def test_a_chunk_ends_where_native_physics_ends(both: tuple[LiberoEnv, LiberoEnv]) -> None:
-    actions = chunk(4)
+    actions = chunk()
     controls = [env.step_continuous(actions) for env in both]
     ours, theirs = (env.state() for env in both)
     assert np.abs(ours.qpos - theirs.qpos).max() < 1e-4
@@ -84,7 +88,7 @@ def test_images_show_the_moment_that_native_physics_shows(both: tuple[LiberoEnv,
     for env in both:
         (group,) = env.physics.groups
         np.testing.assert_array_equal(group.seen_qpos, group.qpos)
-        env.step_continuous(chunk(4))
+        env.step_continuous(chunk())
         seen.append(group.seen_qpos.copy())
         now.append(group.qpos.copy())
     # The hand is on its way: the end of the tick, two substeps later, is elsewhere.
@@ -94,14 +98,14 @@ def test_images_show_the_moment_that_native_physics_shows(both: tuple[LiberoEnv,
 
 
 def test_a_chunk_is_the_same_as_its_ticks(warp: LiberoEnv) -> None:
-    actions = chunk(3)
+    actions = chunk()
     warp.set_episodes(tasks=0, episodes=range(SLOTS))
     warp.reset()
     warp.step_continuous(actions)
     whole = warp.state().qpos
     warp.set_episodes(tasks=0, episodes=range(SLOTS))
     warp.reset()
-    for k in range(3):
+    for k in range(TICKS):
         warp.step_continuous(actions[:, k])
     assert np.abs(warp.state().qpos - whole).max() < 1e-5
 
@@ -153,10 +157,10 @@ def test_a_motion_is_carried_on_in_the_next_call(warp: LiberoEnv) -> None:
 def test_watchers_hear_of_every_tick_of_a_compiled_call(warp: LiberoEnv) -> None:
     warp.set_episodes(tasks=0, episodes=range(SLOTS))
     warp.reset()
-    actions, seen = chunk(2), []
+    actions, seen = chunk(), []
     with warp.watched(lambda action, active: seen.append((action.copy(), active.copy()))):
         warp.step_continuous(actions)
-    assert len(seen) == 2
+    assert len(seen) == TICKS
     for k, (action, active) in enumerate(seen):
         np.testing.assert_allclose(action, actions[:, k])
         assert active.all()
@@ -166,9 +170,9 @@ def test_a_finished_slot_stands_still(warp: LiberoEnv) -> None:
     warp.set_episodes(tasks=0, episodes=range(SLOTS))
     warp.reset()
     before = warp.state().qpos
-    ran = warp.physics.run(chunk(2), np.array([True, False, True]), np.full(SLOTS, 9))
+    ran = warp.physics.run(chunk(), np.array([True, False, True]), np.full(SLOTS, 9))
     after = warp.state().qpos
-    np.testing.assert_array_equal(ran.ticks, [2, 0, 2])
+    np.testing.assert_array_equal(ran.ticks, [TICKS, 0, TICKS])
     np.testing.assert_array_equal(after[1], before[1])
     assert (after[0] != before[0]).any()
 
@@ -179,11 +183,11 @@ def test_a_state_that_is_not_finite_is_a_fault_of_its_slot_alone(warp: LiberoEnv
     group = warp.physics.groups[0]
     qvel = group.worlds.data.qvel.at[1, 12].set(jnp.nan)
     group.replace(group.worlds._replace(data=group.worlds.data.replace(qvel=qvel)))
-    control = warp.step_continuous(chunk(2))
+    control = warp.step_continuous(chunk())
     assert control.info["fault"][1] == "non-finite or huge state"
     np.testing.assert_array_equal(control.truncated, [False, True, False])
     assert control.info["fault"][0] == control.info["fault"][2] == ""
-    np.testing.assert_array_equal(control.info["ticks"], [2, 1, 2])
+    np.testing.assert_array_equal(control.info["ticks"], [TICKS, 1, TICKS])
 
 
 def test_too_few_constraint_rows_are_a_fault(warp: LiberoEnv) -> None:
@@ -191,6 +195,7 @@ def test_too_few_constraint_rows_are_a_fault(warp: LiberoEnv) -> None:
     budget = replace(warp.physics.groups[0].built.budget, rows=rows // 2)
     env = libero("warp", budget=budget)
     assert all("njmax" in fault for fault in env.step_continuous(chunk(1)).info["fault"])
+    env.close()
 
 
 def test_budgets_name_what_is_wrong() -> None:

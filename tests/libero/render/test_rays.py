@@ -21,6 +21,7 @@ from vecenv.libero.tasks.sources import installed_tasks
 from vecenv.observations import UnknownCamera
 
 pytest.importorskip("warp")
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 RAYS = RenderConfig(height=24, width=32, lod="fast", engine="raytrace")
 IDLE = np.array([0, 0, 0, 0, 0, 0, -1.0])
