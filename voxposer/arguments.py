@@ -102,5 +102,6 @@ def _described(shapes: tuple[tuple[int | None, ...], ...]) -> str:
     if not shapes:
         return "numbers"
     return " or ".join(
-        f"{shape[0]} numbers" if len(shape) == 1 else "rows of " + f"{shape[-1]} numbers" for shape in shapes
+        "a number" if not shape else f"{shape[0]} numbers" if len(shape) == 1 else f"rows of {shape[-1]} numbers"
+        for shape in shapes
     )

@@ -364,9 +364,14 @@ def read_settings(path: Path) -> dict[str, Any]:
     import yaml
 
     try:
-        if path.stat().st_size > _MOST_BYTES:
+        with path.open("rb") as file:  # which may be a pipe, without a size
+            content = file.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
             raise ConfigError(f"{path} cannot be read: it has more than {_MOST_BYTES:,} bytes")
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = content.decode("utf-8")
+        values = yaml.safe_load(text)
+        if repeated := _repeated_key(yaml.compose(text, yaml.SafeLoader)):
+            raise ConfigError(f"{path} cannot be read: {repeated}")
     except ConfigError:
         raise
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: bytes, dates that are none
@@ -378,6 +383,25 @@ def read_settings(path: Path) -> dict[str, Any]:
             f"{path} cannot be read: with its aliases written out it has more than {_MOST_VALUES:,} values"
         )
     return values
+
+
+def _repeated_key(root: Any) -> str:
+    """Where a mapping of a YAML document has a key twice, of which YAML would take the last; "" for nowhere."""
+    waiting, seen = [root], set()
+    while waiting:
+        node = waiting.pop()
+        if node is None or id(node) in seen or isinstance(node.value, str):
+            continue
+        seen.add(id(node))
+        pairs = [pair for pair in node.value if isinstance(pair, tuple)]
+        waiting += [part for pair in pairs for part in pair] or node.value
+        known: set[tuple[str, str]] = set()
+        for key, _ in pairs:
+            if isinstance(key.value, str):
+                if (key.tag, key.value) in known:
+                    return f"line {key.start_mark.line + 1} has {key.value!r:.60} for the second time"
+                known.add((key.tag, key.value))
+    return ""
 
 
 def _is_small(values: object) -> bool:

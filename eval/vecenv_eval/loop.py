@@ -27,7 +27,7 @@ from vecenv_eval.config import ConfigError, EvalConfig
 from vecenv_eval.drive import drive
 from vecenv_eval.environments import Environments, Placed, slots_of
 from vecenv_eval.episodes import Episode, Stream, Suite, plan, streams
-from vecenv_eval.policies import Ending, Logging, Policy, PolicyUnavailable, Refillable, error_of, extras_of
+from vecenv_eval.policies import Ending, Logging, Policy, PolicyUnavailable, Refillable, error_of, extras_of, in_words
 from vecenv_eval.recorders import make_recorders
 from vecenv_eval.results import Progress, count
 from vecenv_eval.simulator import Simulator
@@ -317,7 +317,7 @@ class EpisodeLoop:
 
     def _write_errors(self, number: int, episodes: Sequence[Episode], error: Exception) -> None:
         """Record an exception as the error of the episodes that it cost."""
-        cause = f"{type(error).__name__}: {error}".splitlines()[0]
+        cause = in_words(error).splitlines()[0]
         self._write_error(number, episodes, cause, traceback.format_exc())
 
     def _write_error(self, number: int, episodes: Sequence[Episode], cause: str, details: str) -> None:

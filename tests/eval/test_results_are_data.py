@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import sqlite3
 import sys
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -194,3 +197,55 @@ def test_the_command_to_go_on_says_what_has_to_be_given_again(world: FakeWorld) 
     )
     assert done.exit_code == 1
     assert "vecenv eval --resume 'a b' --policy own_policy:P --policy-arg 'weights=it'\"'\"'s 1'" in done.stdout
+
+
+# Names that a run writes to, or that SQLite does.
+WRITTEN = [
+    ".lock",
+    ".lock.host",
+    "episodes.jsonl",
+    "config.json.tmp",
+    "summary.json.tmp",
+    "report.md.tmp",
+    "errors.log",
+]
+
+
+@pytest.mark.parametrize("name", [*WRITTEN, "episodes.sqlite", "episodes.sqlite-wal", "episodes.sqlite-journal"])
+def test_nothing_is_written_through_a_link(name: str) -> None:
+    folder, mine = begin(), Path("precious")
+    mine.write_text("mine")
+    if name.startswith("episodes.sqlite"):
+        (folder / "episodes.jsonl").unlink()
+        rewrite(folder / "config.json", {"store": "sqlite"})
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(mine.resolve())
+    for command in (["eval", "--resume", "here"], ["merge", "whole", "here"], ["report", "here"]):
+        done = invoke(*command)
+        assert done.exit_code in (0, 1, 2)
+        assert done.exception is None or isinstance(done.exception, SystemExit), command
+        assert mine.read_text() == "mine", command
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize("name", ["config.json", "episodes.jsonl", "episodes.sqlite", "summary.json", ".lock"])
+def test_a_pipe_is_not_waited_for(name: str) -> None:
+    folder = begin()
+    if name == "episodes.sqlite":
+        (folder / "episodes.jsonl").unlink()
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    for command in (["report", "here"], ["export", "here", "--format", "jsonl"], ["eval", "--resume", "here"]):
+        done = invoke(*command)
+        assert done.exit_code in (0, 2)
+        assert done.exception is None or isinstance(done.exception, SystemExit), command
+        assert len(done.stderr.splitlines()) < 3
+
+
+def test_a_database_with_triggers_is_refused() -> None:
+    assert invoke("eval", "--suite", SUITE, "--policy", "zero", "--store", "sqlite", "--out", "here").exit_code == 0
+    with closing(sqlite3.connect("here/episodes.sqlite")) as connection, connection:
+        connection.execute("CREATE TRIGGER t AFTER INSERT ON episodes BEGIN DELETE FROM episodes; END")
+    for command in ("report", "export"):
+        refused(invoke(command, "here", *(["--format", "jsonl"] if command == "export" else [])), "has triggers")
+    refused(invoke("eval", "--resume", "here"), "has triggers")

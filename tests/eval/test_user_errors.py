@@ -75,6 +75,7 @@ BAD_POLICIES = {
     "nothing": ("X = 1\n", "P"),
     "no_policy": ("class P:\n    name = 'p'\n", "P"),
     "module": (None, "P"),
+    "property": ("class P:\n    @property\n    def name(self): raise ValueError('none')\n" + VERBS, "P"),
 }
 SAYS = {
     "raises": ("policy 'bad_raises:P': making it failed: OSError: no weights in /models", "bad_raises.py:4)"),
@@ -85,9 +86,10 @@ SAYS = {
     "nothing": ("the module 'bad_nothing' has no class 'P'",),
     "no_policy": ("is not a policy: it needs a name, reset(env, info) and act(env)",),
     "module": ("importing 'bad_module' failed: ModuleNotFoundError: No module named 'bad_module'",),
+    "property": ("reading its attributes failed: ValueError: none",),
 }
 # What only `vecenv eval` asks of a policy is left out for servers.
-SERVED = {name: words for name, words in SAYS.items() if name != "no_policy"}
+SERVED = {name: words for name, words in SAYS.items() if name not in ("no_policy", "property")}
 
 
 def write_policy(name: str) -> str:
@@ -291,6 +293,8 @@ def test_a_file_that_cannot_be_written_is_one_sentence_from_any_command(
         (b"suit: libero_goal\n", "unknown setting 'suit': did you mean suite"),
         (b"suite: libero_goal\nmax_steps: many\n", "max_steps"),
         (b"[" * 3000, "cannot be read"),
+        (b"suite: a\nseed: 1\nsuite: b\n", "line 3 has 'suite' for the second time"),
+        (b"policy_args: {a: 1, a: 2}\n", "line 1 has 'a' for the second time"),
         (None, "No such file"),
     ],
 )
@@ -299,6 +303,28 @@ def test_a_settings_file_that_cannot_be_used(world: FakeWorld, content: bytes | 
         Path("settings.yaml").write_bytes(content)
     assert_one_sentence(invoke("eval", "--suite", SUITE, "--config", "settings.yaml", "--out", "here"), says)
     assert not Path("here").exists()
+
+
+def test_an_exception_without_a_message_of_its_own_is_an_error_of_its_episodes(world: FakeWorld) -> None:
+    source = "class E(Exception):\n    def __str__(self): raise ValueError\n"
+    source += "class P:\n    name = 'p'\n    def reset(self, env, info): ...\n    def act(self, env): raise E\n"
+    Path("speechless.py").write_text(source)
+    assert evaluate("--policy", "speechless:P", "--tasks", "0").exit_code == 1
+    rows = [json.loads(line) for line in Path("here/episodes.jsonl").read_text().splitlines()]
+    assert {row["error"] for row in rows} == {"E"}
+
+
+def test_a_folder_whose_name_is_too_long(world: FakeWorld) -> None:
+    done = invoke("eval", "--suite", SUITE, "--policy", "zero", "--out", "a" * 300)
+    assert done.exit_code == 2
+    assert "File name too long" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a file without an end")
+def test_a_settings_file_without_an_end(world: FakeWorld) -> None:
+    done = invoke("eval", "--suite", SUITE, "--config", "/dev/zero", "--out", "here")
+    assert_one_sentence(done, "/dev/zero cannot be read: it has more than", "bytes")
 
 
 def test_a_folder_instead_of_a_settings_file(world: FakeWorld) -> None:

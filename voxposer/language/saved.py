@@ -151,6 +151,8 @@ def open_llm(config: LlmConfig, replay: Path | None = None) -> Llm:
 
 def _calls(file: Path) -> Iterator[Mapping[str, Any]]:
     """The questions in a file, their long texts put back."""
+    if not file.is_file():
+        raise InvalidFile(f"{file} is not a regular file")
     texts: dict[str, str] = {}
     for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1):
         try:

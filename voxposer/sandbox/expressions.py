@@ -29,7 +29,6 @@ from voxposer.sandbox.iteration import stream
 from voxposer.sandbox.modules import similar
 from voxposer.sandbox.numpy_functions import grid
 from voxposer.sandbox.objects import ERRORS, DType, Error, ErrorType, Function, Module, TypeName, error_class
-from voxposer.sandbox.python_functions import converted
 from voxposer.sandbox.scopes import Comprehension, Scope, targets_of
 from voxposer.sandbox.syntax import SYMBOLS, SandboxError
 
@@ -399,11 +398,11 @@ class Expressions:
         if isinstance(value, Function):
             return value.call
         if isinstance(value, DType):
-            return self._vocabulary(value.name, converted, value)
+            return self._vocabulary(value.name, values.converted, value)
         if isinstance(value, ErrorType):
             return self._of_errors(value)
         if isinstance(value, (Record, RecordList)):  # upstream's are functions that give the present state
-            return lambda: value
+            return self._vocabulary("an observation", lambda guard: value)
         what = f"{name!r} is" if name else "this is"
         if isinstance(value, TypeName):
             raise Refusal("functions", f"{what} a type, which isinstance takes and which is not called", TypeError)

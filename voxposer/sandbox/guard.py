@@ -27,14 +27,17 @@ ELEMENTS_A_STEP = 1000
 _STEPS_A_LOOK = 100
 # Seconds that pass before the time of this thread is read again: that is a call of the system, and slow on some.
 _CLOCK_S = 0.005
-# Bytes counted for an item of a list (enough for a tuple of two numbers), and for a character.
-ITEM_BYTES, _CHARACTER_BYTES = 100, 4
+# Bytes counted for an item of a list (enough for a tuple of two numbers), for a character, for a list, tuple,
+# dictionary or set besides its items, and for an array or a view of one besides its elements.
+ITEM_BYTES, _CHARACTER_BYTES, _CONTAINER_BYTES, ARRAY_BYTES = 100, 4, 220, 250
 # Elements that one call may put in order, and the steps that a thousand of them count for.
 _SORTED, _STEPS_OF_SORTING = 2**22, 10
 # Largest number of dimensions of an array: the cost of printing or rolling one grows exponentially with it.
 _DIMENSIONS = 8
 # Bytes counted for a function with its scope, for a suspended generator, and for an error besides its text.
 FUNCTION_BYTES, STREAM_BYTES, _ERROR_BYTES = 2000, 4000, 500
+# Tuples of one hash that may be keys, and bytes for remembering one.
+_ALIKE, _KEY_BYTES = 32, 300
 # Characters of a message that comes from elsewhere.
 _MESSAGE = 600
 
@@ -221,6 +224,7 @@ class Guard:
 
     def __init__(self, budget: Budget) -> None:
         self.budget, self.limits = budget, budget.limits
+        self._keys: dict[int, list[tuple[Any, ...]]] = {}
 
     def hold(self, size: int) -> None:
         """Count bytes that the program has made or is about to make."""
@@ -263,19 +267,29 @@ class Guard:
         if count > self.limits.integer_bits:
             raise Refusal("size", f"an integer of more than {self.limits.integer_bits} bits")
 
+    def remember_key(self, key: tuple[Any, ...]) -> None:
+        """Refuse a key if too many others have its hash: Python compares it with each of them, every time."""
+        alike = self._keys.setdefault(hash(key), [])
+        if any(key is known or key == known for known in alike):
+            return
+        if len(alike) >= _ALIKE:
+            raise Refusal("size", f"more than {_ALIKE} tuples of one hash as keys, such as (-1,) and (-2,)")
+        self.hold(_KEY_BYTES)
+        alike.append(key)
+
     def take(self, value: object) -> Any:
         """A new value, checked, with its memory counted; a view counts as an array of its size."""
         self.budget.look()
         if isinstance(value, np.ndarray):
             require_numbers(value)
             self.room(value.shape, value.itemsize)
-            self.hold(value.nbytes)
+            self.hold(value.nbytes + ARRAY_BYTES)
         elif isinstance(value, str):
             self.characters(len(value))
             self.hold(len(value) * _CHARACTER_BYTES)
         elif isinstance(value, (list, tuple, dict, set)):
             self.length(len(value))
-            self.hold(len(value) * ITEM_BYTES)
+            self.hold(len(value) * ITEM_BYTES + _CONTAINER_BYTES)
             self.budget.step(len(value) // 100)
         elif type(value) is int:
             self.bits(value.bit_length())
@@ -372,15 +386,21 @@ def about_arguments(name: str, text: str) -> str:
     """What Python says about arguments that a function does not take, by the function's name in programs; "" for other
     texts."""
     found = _ARGUMENTS.match(text)
-    return f"{name}() {found[1]}" if found else ""
+    if not found:
+        return ""
+    if found[1].startswith("takes"):  # so many, and counts one that programs do not see
+        return f"{name}() is given more arguments than it takes"
+    return f"{name}() {found[1]}"
 
 
 _ARGUMENTS = re.compile(r"[\w.<>]+\(\) ((?:takes|got|missing) .*)", re.S)
 
 
 def shortened(text: str, most: int = _MESSAGE) -> str:
-    """A message of at most so many characters, in one line."""
+    """A message of at most so many characters, in one line; what a terminal would obey is escaped."""
     line = " ".join(text[: 4 * most].split())
+    if not line.isprintable():
+        line = "".join(each if each.isprintable() else repr(each)[1:-1] for each in line)
     return line if len(line) <= most else f"{line[: most - 3]}..."
 
 

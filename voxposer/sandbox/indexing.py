@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from voxposer.sandbox.guard import ELEMENTS_A_STEP, Guard, RecordList, Refusal, refuse_kind
-from voxposer.sandbox.values import APPENDED_BYTES, ENTRY_BYTES, hashable, integer, listed, number_of, numbers
+from voxposer.sandbox.values import APPENDED_BYTES, ENTRY_BYTES, hashable, integer, known, listed, number_of, numbers
 
 
 def subscript(guard: Guard, value: object, index: object) -> Any:
@@ -22,7 +22,7 @@ def subscript(guard: Guard, value: object, index: object) -> Any:
         place = _array_index(guard, value, index)
         return _seen(guard, value[place]) if _is_basic(place) else guard.take(value[place])
     if isinstance(value, dict):
-        return value[hashable(guard, index)]
+        return value[known(guard, value, index)]
     place = index if isinstance(index, slice) else integer(index)
     if isinstance(value, RecordList):
         return guard.host("the list of observations", value.__getitem__, place)
@@ -41,6 +41,8 @@ def assign(guard: Guard, value: object, index: object, item: object) -> None:
     """``value[index] = item``."""
     if isinstance(value, np.ndarray):
         place, content = _array_index(guard, value, index), numbers(guard, item)
+        if isinstance(content, np.ndarray) and content.size == 1:
+            content = content.reshape(())  # one number fits anywhere
         if _is_basic(place):
             guard.budget.step(np.size(value[place]) // ELEMENTS_A_STEP)
         value[place] = content
@@ -62,7 +64,7 @@ def assign(guard: Guard, value: object, index: object, item: object) -> None:
 def delete(guard: Guard, value: object, index: object) -> None:
     """``del value[index]``."""
     if isinstance(value, dict):
-        del value[hashable(guard, index)]
+        del value[known(guard, value, index)]
     elif isinstance(value, list):
         guard.budget.step(len(value) // 100)
         del value[index if isinstance(index, slice) else integer(index)]
@@ -157,6 +159,8 @@ def _voxel(guard: Guard, part: object, length: int) -> Any:
         return _voxel_slice(part)
     places = numbers(guard, part)
     if np.ndim(places):
+        if np.isnan(places).any():
+            raise Refusal("value", "an index that is not a number (NaN)")
         return places if places.dtype == bool else np.clip(np.round(places), 0, length - 1).astype(np.int64)
     place = round(number_of(places[()] if isinstance(places, np.ndarray) else places))
     return min(place if place == -1 else max(place, 0), length - 1)

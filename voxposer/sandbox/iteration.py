@@ -13,7 +13,7 @@ import numpy as np
 
 from voxposer.sandbox.guard import Guard, Refusal, kind_of, refuse_kind
 from voxposer.sandbox.objects import DType, Function, Stream
-from voxposer.sandbox.values import integer, iterate, listed, single_number, truth
+from voxposer.sandbox.values import converted, integer, iterate, listed, truth
 
 _NOTHING = object()
 
@@ -42,7 +42,7 @@ def _pulled(guard: Guard, items: Iterator[Any], levels: int) -> Iterator[Any]:
         yield item
 
 
-def callable_of(value: object) -> Callable[..., Any]:
+def callable_of(guard: Guard, value: object) -> Callable[..., Any]:
     """What a program gave as a function, ready to be called with evaluated arguments.
 
     Raises:
@@ -51,28 +51,16 @@ def callable_of(value: object) -> Callable[..., Any]:
     if isinstance(value, Function):
         return value.call
     if isinstance(value, DType):
-        return _CONVERSIONS.get(value.name) or _not_callable(value)
-    return _not_callable(value)
-
-
-def _not_callable(value: object) -> Any:
-    kind = value.name if isinstance(value, DType) else kind_of(value)
-    raise Refusal("functions", f"a value of kind {kind} is called like a function", TypeError)
-
-
-_CONVERSIONS: dict[str, Callable[..., Any]] = {
-    "int": lambda value: int(single_number(value)),
-    "float": lambda value: float(single_number(value)),
-    "bool": lambda value: bool(value),
-}
+        return lambda *values: guard.take(converted(guard, value, *values))
+    raise Refusal("functions", f"a value of kind {kind_of(value)} is called like a function", TypeError)
 
 
 def zipped(guard: Guard, *values: object, strict: object = False) -> Stream:
     """``zip``."""
-    return stream(guard, "zip", _zip([iter(iterate(guard, value)) for value in values], bool(strict)))
+    return stream(guard, "zip", _zip(guard, [iter(iterate(guard, value)) for value in values], truth(guard, strict)))
 
 
-def _zip(sources: list[Iterator[Any]], strict: bool) -> Iterator[Any]:
+def _zip(guard: Guard, sources: list[Iterator[Any]], strict: bool) -> Iterator[Any]:
     while sources:
         row: list[Any] = []
         for source in sources:
@@ -85,7 +73,7 @@ def _zip(sources: list[Iterator[Any]], strict: bool) -> Iterator[Any]:
                 if strict and any(next(other, _NOTHING) is not _NOTHING for other in sources[1:]):
                     raise Refusal("value", "zip(strict=True) of values of different lengths")
                 return
-        yield tuple(row)
+        yield guard.take(tuple(row))
 
 
 def enumerated(guard: Guard, iterable: object, start: object = 0) -> Stream:
@@ -97,13 +85,13 @@ def mapped(guard: Guard, function: object, *values: object) -> Stream:
     """``map``."""
     if not values:
         raise Refusal("types", "map takes a function and at least one value to loop over")
-    call, rows = callable_of(function), _zip([iter(iterate(guard, value)) for value in values], strict=False)
+    call, rows = callable_of(guard, function), _zip(guard, [iter(iterate(guard, value)) for value in values], False)
     return stream(guard, "map", (call(*row) for row in rows))
 
 
 def filtered(guard: Guard, function: object, iterable: object) -> Stream:
     """``filter``."""
-    call = None if function is None else callable_of(function)
+    call = None if function is None else callable_of(guard, function)
     return stream(guard, "filter", _filter(guard, call, iterate(guard, iterable)))
 
 

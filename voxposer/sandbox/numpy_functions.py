@@ -20,10 +20,11 @@ from voxposer.sandbox.values import (
     count_of,
     digits_of,
     dtype_of,
-    integer,
     listed,
     number_of,
     numbers,
+    one_axis,
+    require_near,
     require_power,
     shape_of,
 )
@@ -45,11 +46,19 @@ def elementwise(name: str, arity: int) -> Function:
         if name == "power":
             require_power(guard, *operands)
         broadcast(guard, *operands)
-        return function(*operands)
+        if name in _REMAINDERS:
+            require_near(guard, *operands)
+        try:
+            return function(*operands)
+        except TypeError:
+            kinds = " and ".join(str(np.asarray(operand).dtype) for operand in operands)
+            raise Refusal("types", f"np.{name} is not made for {kinds}") from None
 
     return apply
 
 
+# Functions that compute remainders.
+_REMAINDERS = ("mod", "remainder", "floor_divide")
 # Reductions that need a number at least.
 _OF_SOME = ("mean", "std", "var", "median", "ptp")
 
@@ -178,8 +187,9 @@ def joining(name: str, with_axis: bool) -> Function:
     def apply(guard: Guard, arrays: object, **options: object) -> np.ndarray:
         if not set(options) <= ({"axis"} if with_axis else set()):
             raise Refusal("types", f"np.{name} takes arrays{' and axis' if with_axis else ''}")
-        guard.room((guard.weigh(arrays).numbers,))
-        parts = [numbers(guard, part) for part in listed(guard, arrays)]
+        items = listed(guard, arrays)
+        guard.room((guard.weigh(items).numbers,))
+        parts = [numbers(guard, part) for part in items]
         return function(parts, **{key: axis_of(value) for key, value in options.items()})
 
     if not with_axis:
@@ -276,7 +286,7 @@ def ordering(name: str) -> Function:
         values = np.asarray(numbers(guard, a))
         guard.room(values.shape)
         guard.order(values.size)
-        return function(values, axis=None if axis is None else integer(axis))
+        return function(values, axis=None if axis is None else one_axis(axis))
 
     return apply
 
@@ -303,7 +313,7 @@ def diff(guard: Guard, a: object, axis: object = -1) -> np.ndarray:
     """``np.diff``."""
     values = numbers(guard, a)
     broadcast(guard, values)
-    return np.diff(values, axis=integer(axis))
+    return np.diff(values, axis=one_axis(axis))
 
 
 def copy_array(guard: Guard, a: object) -> np.ndarray:
@@ -325,7 +335,7 @@ def repeat(guard: Guard, a: object, repeats: object, axis: object = None) -> np.
     """``np.repeat`` by one number."""
     values, times = np.asarray(numbers(guard, a)), count_of(repeats)
     guard.room((values.size, times))
-    return np.repeat(values, times, axis=None if axis is None else integer(axis))
+    return np.repeat(values, times, axis=None if axis is None else one_axis(axis))
 
 
 def append(guard: Guard, arr: object, values: object, axis: object = None) -> np.ndarray:
@@ -342,7 +352,7 @@ def unique(guard: Guard, ar: object, axis: object = None) -> np.ndarray:
     guard.room(values.shape)
     guard.order(values.size)
     # Counting takes NumPy's way of sorting: its hash table for integers takes ten times as long, and more memory.
-    return np.unique(values, return_counts=True, axis=None if axis is None else integer(axis))[0]
+    return np.unique(values, return_counts=True, axis=None if axis is None else one_axis(axis))[0]
 
 
 def isin(guard: Guard, element: object, test_elements: object) -> np.ndarray:
@@ -355,7 +365,7 @@ def isin(guard: Guard, element: object, test_elements: object) -> np.ndarray:
 
 def swapaxes(guard: Guard, a: object, axis1: object, axis2: object) -> np.ndarray:
     """``np.swapaxes``."""
-    return np.swapaxes(np.asarray(numbers(guard, a)), integer(axis1), integer(axis2))
+    return np.swapaxes(np.asarray(numbers(guard, a)), one_axis(axis1), one_axis(axis2))
 
 
 def average(guard: Guard, a: object, axis: object = None, weights: object = None) -> Any:

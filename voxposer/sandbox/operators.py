@@ -24,6 +24,7 @@ from voxposer.sandbox.values import (
     listed,
     number_of,
     numbers,
+    require_near,
     require_power,
     truth,
 )
@@ -114,6 +115,8 @@ def _numeric_operation(guard: Guard, symbol: str, left: object, right: object, i
     if symbol == "**":
         require_power(guard, a, b)
     broadcast(guard, a, b)
+    if symbol in ("%", "//"):
+        require_near(guard, a, b)
     table = _IN_PLACE if in_place and isinstance(a, np.ndarray) else _OPERATORS
     return table[symbol](a, b)
 

@@ -28,10 +28,10 @@ from voxposer.sandbox.values import (
     hashable,
     in_set_order,
     integer,
+    known,
     listed,
     number_of,
     numbers,
-    single_number,
     truth,
 )
 
@@ -60,7 +60,7 @@ def _keyed(guard: Guard, items: list[Any], key: object) -> list[Any]:
     if key is None:
         keys = items
     else:
-        call = callable_of(key)
+        call = callable_of(guard, key)
         keys = [_scalar(call(item)) for item in items]
     _require_comparable(guard, keys)
     return keys
@@ -106,38 +106,18 @@ def summed(guard: Guard, value: object, start: object = 0) -> Any:
     return total
 
 
-def to_int(guard: Guard, value: object = 0) -> int:
-    """``int``."""
-    made = int(single_number(value))
-    guard.bits(made.bit_length())
-    return made
-
-
-def to_float(guard: Guard, value: object = 0) -> float:
-    """``float``."""
-    return float(single_number(value))
-
-
-def converted(guard: Guard, dtype: DType, *values: object) -> Any:
-    """A number type that is called: ``int(x)``, ``float(x)``, ``bool(x)``, ``np.float32(x)``."""
-    if dtype.name in _PLAIN:
-        return _PLAIN[dtype.name](guard, *values)
-    if len(values) != 1:
-        raise Refusal("types", f"{dtype.name} takes one value")
-    given = numbers(guard, values[0])
-    guard.room(np.shape(given))
-    return np.asarray(given).astype(dtype.dtype)[()]
-
-
-_PLAIN: dict[str, Function] = {"int": to_int, "float": to_float, "bool": lambda guard, value=False: truth(guard, value)}
-
-
 def make_range(guard: Guard, *ends: object) -> range:
     """``range``."""
     made = range(*(integer(end) for end in ends))
     for end in (made.start, made.stop, made.step):
         guard.bits(end.bit_length())
+    if abs(made.stop - made.start) // abs(made.step) > _FAR:
+        raise Refusal("size", f"a range of more than {_FAR} numbers")
     return made
+
+
+# Numbers in a range: as many as Python can count.
+_FAR = 2**62
 
 
 def absolute(guard: Guard, value: object) -> Any:
@@ -349,8 +329,7 @@ def clear(guard: Guard, value: Any) -> None:
 
 def pop_key(guard: Guard, value: dict[Any, Any], key: object, default: object = _NO_DEFAULT) -> Any:
     """``dict.pop``."""
-    known = hashable(guard, key)
-    return value.pop(known) if default is _NO_DEFAULT else value.pop(known, default)
+    return value.pop(known(guard, value, key)) if default is _NO_DEFAULT else value.pop(hashable(guard, key), default)
 
 
 def set_default(guard: Guard, value: dict[Any, Any], key: object, default: object = None) -> Any:

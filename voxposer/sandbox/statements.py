@@ -44,8 +44,8 @@ End = Jump | Returned | None
 # What a block yields are the values of yield statements.
 Block = Generator[Any, None, End]
 
-# Levels of depth that a call counts for, besides those of its blocks.
-_CALL_LEVELS = 3
+# Levels of depth that a call counts for, besides those of its blocks, and bytes of a generator for each.
+_CALL_LEVELS, _LEVEL_BYTES = 3, 1000
 
 
 class Statements(Expressions):
@@ -313,6 +313,7 @@ class Statements(Expressions):
             inner = self._inner(names, signature.bound(given, options), scope)
             if yields:
                 self._captured.append(inner)
+                self._guard.hold(levels * _LEVEL_BYTES)
                 return self._guard.take(stream(self._guard, "generator", self._generated(body, inner), levels))
             budget, depth = self._guard.budget, self._guard.budget.depth
             try:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from types import MappingProxyType
 from typing import Any, SupportsIndex, cast
 
@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from voxposer.sandbox.guard import (
+    ARRAY_BYTES,
     Guard,
     Opaque,
     Record,
@@ -29,8 +30,14 @@ from voxposer.sandbox.objects import DType, Error, ErrorType, Function, Stream, 
 
 # Largest number of digits for round().
 _DIGITS = 20
-# Axes that one call may name.
-_AXES = 8
+# Characters of text that is read as an integer.
+_DIGITS_READ = 200
+# Axes that one call may name, and the largest number of one.
+_AXES, _LARGEST_AXIS = 8, 2**31 - 1
+# Remainders that are computed without a look at the numbers, and bits between numbers and divisors of all of them.
+_FEW, _REMAINDER_BITS = 10_000, 2**28
+# Values in a tuple that is a key.
+_IN_KEY = 32
 # Bytes counted for an item put into a list, and into a dictionary or a set.
 APPENDED_BYTES, ENTRY_BYTES = 16, 100
 
@@ -112,8 +119,16 @@ def axis_of(value: object) -> int | tuple[int, ...] | None:
     if isinstance(value, (tuple, list)):
         if len(value) > _AXES:
             raise Refusal("size", f"{len(value)} axes; {_AXES} are allowed")
-        return tuple(integer(item) for item in value)
-    return integer(value)
+        return tuple(one_axis(item) for item in value)
+    return one_axis(value)
+
+
+def one_axis(value: object) -> int:
+    """An axis, or a shift along one."""
+    number = integer(value)
+    if abs(number) > _LARGEST_AXIS:
+        raise Refusal("value", f"an axis or a shift of {number}")
+    return number
 
 
 def count_of(value: object) -> int:
@@ -135,6 +150,39 @@ def single_number(value: object) -> Any:
     return value if kind_of(value) in ("number", "text") else refuse_kind(value, "a number")
 
 
+def to_int(guard: Guard, value: object = 0) -> int:
+    """``int``."""
+    given = single_number(value)
+    if isinstance(given, str) and len(given) > _DIGITS_READ:
+        raise Refusal("size", f"an integer of {len(given)} characters; {_DIGITS_READ} are allowed")
+    made = int(given)
+    guard.bits(made.bit_length())
+    return made
+
+
+def to_float(guard: Guard, value: object = 0) -> float:
+    """``float``."""
+    return float(single_number(value))
+
+
+def converted(guard: Guard, dtype: DType, *values: object) -> Any:
+    """A number type that is called: ``int(x)``, ``float(x)``, ``bool(x)``, ``np.float32(x)``."""
+    if dtype.name in _PLAIN:
+        return _PLAIN[dtype.name](guard, *values)
+    if len(values) != 1:
+        raise Refusal("types", f"{dtype.name} takes one value")
+    given = numbers(guard, values[0])
+    guard.room(np.shape(given))
+    return np.asarray(given).astype(dtype.dtype)[()]
+
+
+_PLAIN: dict[str, Callable[..., Any]] = {
+    "int": to_int,
+    "float": to_float,
+    "bool": lambda guard, value=False: truth(guard, value),
+}
+
+
 def digits_of(value: object) -> int:
     """A number of digits, within bounds."""
     digits = integer(value)
@@ -147,6 +195,25 @@ def require_power(guard: Guard, base: object, exponent: object) -> None:
     """Refuse a power of integers that would be too large."""
     if isinstance(base, int) and isinstance(exponent, int) and exponent > 0 and abs(base) > 1:
         guard.bits(int(exponent * math.log2(abs(base))))
+
+
+def require_near(guard: Guard, dividend: npt.ArrayLike, divisor: npt.ArrayLike) -> None:
+    """Refuse remainders that take long: C's ``fmod`` subtracts once for each bit between the two exponents."""
+    a, b = np.asarray(dividend), np.asarray(divisor)
+    elements = math.prod(np.broadcast_shapes(a.shape, b.shape))
+    if elements < _FEW or "f" not in a.dtype.kind + b.dtype.kind:
+        return
+    largest, smallest = _magnitudes(a)[1], _magnitudes(b)[0]
+    bits = math.frexp(largest)[1] - math.frexp(smallest)[1] if largest and smallest else 0
+    if elements * bits > _REMAINDER_BITS:
+        raise Refusal("steps", f"{elements} remainders of numbers up to {largest:g} by numbers down to {smallest:g}")
+
+
+def _magnitudes(values: np.ndarray) -> tuple[float, float]:
+    """The smallest and the largest magnitude of an array's finite numbers other than 0; 0 and 0 if it has none."""
+    sizes = np.abs(values)
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+    return (float(sizes.min()), float(sizes.max())) if sizes.size else (0.0, 0.0)
 
 
 def truth(guard: Guard, value: object) -> bool:
@@ -165,14 +232,28 @@ def truth(guard: Guard, value: object) -> bool:
 
 
 def hashable(guard: Guard, key: object) -> Any:
-    """A key or an item of a set: text, a number, None, or a tuple of them."""
+    """A key or an item of a set: text, a number, None, or a tuple of a few of them."""
     weight = guard.weigh(key)
     guard.characters(weight.characters)
     if isinstance(key, tuple):
         if not weight.kinds <= {"text", "number", "None"} or _holds_unhashable(key):
             raise Refusal("types", "a tuple as a key holds text, numbers and None only")
+        if weight.numbers > _IN_KEY:
+            raise Refusal("size", f"a tuple of {weight.numbers} values as a key; {_IN_KEY} are allowed")
+        guard.remember_key(key)
     elif kind_of(key) not in ("text", "number", "None"):
         refuse_kind(key, "text or a number as the key")
+    return key
+
+
+def known(guard: Guard, dictionary: Mapping[Any, Any], key: object) -> Any:
+    """A key that a dictionary has.
+
+    Raises:
+        Refusal: it has no such key.
+    """
+    if hashable(guard, key) not in dictionary:
+        raise Refusal("value", f"the dictionary has no key {key!r:.80}", KeyError)
     return key
 
 
@@ -204,11 +285,28 @@ def iterate(guard: Guard, value: object) -> Iterable[Any]:
 
 
 def in_set_order(items: set[Any]) -> list[Any]:
-    """The items of a set in an order that is the same in every process: numbers by size, else by spelling."""
-    try:
-        return sorted(items)
-    except TypeError:
-        return sorted(items, key=repr)
+    """The items of a set in an order that is the same in every process: None, NaN, numbers by size, text by spelling,
+    tuples item by item."""
+    return sorted(items, key=_rank)
+
+
+def _rank(item: Any) -> tuple[Any, ...]:
+    """What items of a set are put in order by: it holds them, and copies nothing."""
+    if item is None:
+        return (0,)
+    if isinstance(item, str):
+        return (3, item)
+    if isinstance(item, tuple):
+        return (4, *map(_rank, item))
+    return (2, item) if item == item else (1,)
+
+
+def counted(guard: Guard, value: object) -> Iterator[Any]:
+    """What a loop over the value runs through, each item a step: for loops that Python runs, not the program."""
+    for item in iterate(guard, value):
+        if not isinstance(value, Stream):  # which counts its items itself
+            guard.budget.step()
+        yield item
 
 
 def listed(guard: Guard, value: object) -> list[Any]:
@@ -216,6 +314,8 @@ def listed(guard: Guard, value: object) -> list[Any]:
     items = iterate(guard, value)
     if isinstance(items, Sized):
         guard.length(len(items))
+        if isinstance(items, np.ndarray) and items.ndim > 1:
+            guard.hold(len(items) * ARRAY_BYTES)
         return list(items)
     made: list[Any] = []
     for item in items:

@@ -17,7 +17,7 @@ from voxposer.sandbox import numpy_functions as npf
 from voxposer.sandbox import python_functions as pyf
 from voxposer.sandbox.guard import Guard
 from voxposer.sandbox.operators import dot, power_of
-from voxposer.sandbox.values import array, hashable, iterate, length_of, listed, number_of, truth
+from voxposer.sandbox.values import array, counted, hashable, length_of, listed, number_of, truth
 
 Function = Callable[..., Any]
 
@@ -114,11 +114,11 @@ COPY: Mapping[str, Function] = MappingProxyType({"copy": pyf.shallow_copy, "deep
 
 
 def _any(guard: Guard, iterable: object) -> bool:
-    return any(truth(guard, item) for item in iterate(guard, iterable))
+    return any(truth(guard, item) for item in counted(guard, iterable))
 
 
 def _all(guard: Guard, iterable: object) -> bool:
-    return all(truth(guard, item) for item in iterate(guard, iterable))
+    return all(truth(guard, item) for item in counted(guard, iterable))
 
 
 BUILTINS: Mapping[str, Function] = MappingProxyType(

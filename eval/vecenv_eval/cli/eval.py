@@ -10,6 +10,7 @@ that resumes it is printed).
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
@@ -156,7 +157,9 @@ def _run_new(display: Display, config: EvalConfig, folder: Path) -> tuple[int, P
     from vecenv_eval.results import CAMPAIGN, open_or_begin
     from vecenv_eval.runner import Evaluation
 
-    if (folder / CAMPAIGN).is_file():
+    with _disk_errors(folder):
+        several = (folder / CAMPAIGN).is_file()
+    if several:
         raise ConfigError(f"{folder} is already there and holds several suites or seeds: name another folder")
     evaluation = Evaluation(config)
     with _disk_errors(folder):
@@ -259,7 +262,7 @@ def _disk_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, StoreWriteError) as error:
-        there = any((folder / name).is_file() for name in (CONFIG, CAMPAIGN))
+        there = any(os.path.isfile(folder / name) for name in (CONFIG, CAMPAIGN))  # noqa: PTH113  (raises nothing)
         again = f" What was computed is kept; to go on: {resume_command(folder)}" if there else ""
         what = (
             f"the results in {folder} cannot be written: {error.strerror or error}{_which(error, folder)}"

@@ -179,7 +179,12 @@ def make_policy(name: str, given: Mapping[str, Any] | None = None, /, *, seed: i
         raise
     except (Exception, SystemExit) as error:  # whatever a policy's constructor raises
         raise PolicyError(f"policy {name!r}: making it failed: {raised(error)}") from error
-    if not isinstance(policy, Policy):
+    try:
+        fits = isinstance(policy, Policy)
+        hasattr(policy, "needed_cameras")  # as the first of the optional methods to be asked for
+    except Exception as error:  # whatever a property or __getattr__ raises
+        raise PolicyError(f"policy {name!r}: reading its attributes failed: {raised(error)}") from error
+    if not fits:
         raise PolicyError(f"policy {name!r} {_NO_POLICY}")
     return policy
 
@@ -237,9 +242,17 @@ def _makes_policies(found: object) -> TypeGuard[Callable[..., object]]:
     return isinstance(found, type) and all(callable(getattr(found, verb, None)) for verb in ("reset", "act"))
 
 
+def in_words(error: BaseException) -> str:
+    """An exception's type and message; the type alone where making the message raises another exception."""
+    try:
+        return f"{type(error).__name__}: {error}"
+    except Exception:
+        return type(error).__name__
+
+
 def raised(error: BaseException) -> str:
     """An exception in a sentence: its type, its message, and the file and line that raised it."""
-    text = " ".join(f"{type(error).__name__}: {error}".rstrip(": ").split())
+    text = " ".join(in_words(error).rstrip(": ").split())
     frames = traceback.extract_tb(error.__traceback__)
     own = [
         frame for frame in frames if not frame.filename.startswith("<frozen") and frame.filename != importlib.__file__

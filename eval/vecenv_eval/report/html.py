@@ -23,6 +23,7 @@ from vecenv_eval.report.run import Run, SuiteRun
 from vecenv_eval.report.summary import Row
 from vecenv_eval.report.tables import PARTS, part_cells
 from vecenv_eval.store import Record
+from vecenv_eval.store.files import read_regular
 
 TEMPLATE = "page.html.j2"
 EMBED_MB = 20.0
@@ -130,7 +131,7 @@ def _view(suite: SuiteRun, record: Record, beside: Path, room: float) -> tuple[E
     video = ""
     if path is not None and path.stat().st_size <= room:
         used = path.stat().st_size
-        video = "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode()
+        video = "data:video/mp4;base64," + base64.b64encode(read_regular(path)).decode()
     elif path is not None:
         video = quote(os.path.relpath(path.resolve(), beside.resolve()).replace(os.sep, "/"))
     return EpisodeView(

@@ -1,12 +1,17 @@
 """Files that are whole after a crash or a power cut: replaced in one step, or appended to and synced.
 
+A folder may be a stranger's: nothing is written through a link, which could lead to any file of this machine, and
+nothing is read from a pipe or a device, which could have no end (:func:`open_regular`).
+
 :func:`read_json` reads what may be damaged or a stranger's, with limits on its size, depth and numbers.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -28,7 +33,7 @@ def read_json(path: Path) -> dict[str, Any]:
     if (size := path.stat().st_size) > MOST_BYTES:
         raise StoreError(f"{path} cannot be read: it has {size:,} bytes, more than {MOST_BYTES:,}")
     try:
-        content = parse_json(path.read_bytes())
+        content = parse_json(read_regular(path))
     except ValueError as error:
         raise StoreError(f"{path} cannot be read: {error}") from None
     if not isinstance(content, dict):
@@ -62,10 +67,47 @@ def _checked(value: Any, levels: int) -> Any:
     return unicode(value) if isinstance(value, str) else value
 
 
+def open_regular(path: Path, flags: int) -> int:
+    """A handle on a regular file, without waiting; what is opened to be written is not opened through a link.
+
+    Args:
+        path: the file.
+        flags: of ``os.open``.
+
+    Raises:
+        OSError: it cannot be opened, or is a folder.
+        StoreError: it is a link to be written through, a pipe or a device.
+    """
+    writes = bool(flags & (os.O_WRONLY | os.O_RDWR))
+    if writes and path.is_symlink():
+        raise StoreError(f"{path} is a link, through which nothing is written: put the file itself there")
+    flags |= getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        handle = os.open(path, flags | (getattr(os, "O_NOFOLLOW", 0) if writes else 0), 0o666)
+    except OSError as error:
+        if error.errno == errno.ENXIO:  # a pipe that nobody reads
+            raise StoreError(f"{path} is not a regular file") from None
+        raise
+    kind = os.fstat(handle).st_mode
+    if stat.S_ISREG(kind):
+        return handle
+    os.close(handle)
+    if stat.S_ISDIR(kind):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise StoreError(f"{path} is not a regular file")
+
+
+def read_regular(path: Path, most: int = -1) -> bytes:
+    """The content of a regular file, of at most so many bytes; raises as `open_regular`."""
+    with os.fdopen(open_regular(path, os.O_RDONLY), "rb") as file:
+        return file.read(most)
+
+
 def append_text(path: Path, text: str) -> None:
     """Append to a file, or make it, and wait until it is on the disk."""
     new = not path.exists()
-    with naming(path), path.open("a", encoding="utf-8") as file:
+    handle = open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    with naming(path), os.fdopen(handle, "a", encoding="utf-8") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
@@ -82,7 +124,9 @@ def replace_bytes(path: Path, content: bytes) -> None:
     """Replace a file in one step and wait until it is on the disk; when that fails, nothing new is left there."""
     temporary = path.with_name(path.name + ".tmp")
     try:
-        with naming(path), temporary.open("wb") as file:
+        if temporary.is_symlink():  # not ours
+            temporary.unlink()
+        with naming(path), os.fdopen(open_regular(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())

@@ -137,7 +137,8 @@ class ResultStore:
         """Remove what a process that was killed left of files that it was replacing; for whoever is writing."""
         for pattern in (f"{CONFIG}.tmp", f"{SUMMARY}.tmp", f"{REPORT}.tmp", f"{DEMOS}/*.tmp", f"{DEMOS}/*.new", _LOGS):
             for path in self.folder.glob(pattern):
-                path.unlink(missing_ok=True)
+                if path.parent == self.folder or not path.parent.is_symlink():  # else those of another folder
+                    path.unlink(missing_ok=True)
 
     def discard(self) -> None:
         """Remove the folder if it holds no episode and nothing but what :meth:`create` puts there."""

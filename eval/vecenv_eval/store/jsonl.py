@@ -6,11 +6,12 @@ A crash can cut off the last line; it is passed over by readers and removed befo
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from vecenv_eval.episodes import Episode
-from vecenv_eval.store.files import append_text, parse_json
+from vecenv_eval.store.files import append_text, open_regular, parse_json, read_regular
 from vecenv_eval.store.record import Record, StoreError, StoreWriteError, from_plain, to_plain
 
 EPISODES = "episodes.jsonl"
@@ -54,7 +55,7 @@ class JsonlRows:
             StoreError: the file cannot be read, or a line before the last is no record.
         """
         try:
-            content = self.path.read_bytes()
+            content = read_regular(self.path)
         except FileNotFoundError:
             return {}
         except OSError as error:
@@ -88,11 +89,11 @@ class JsonlRows:
 
     def _repair(self) -> None:
         """Make the file end with a newline: after its last record if that lacks nothing else, or by cutting it off."""
-        content = self.path.read_bytes() if self.path.exists() else b""
+        content = read_regular(self.path) if self.path.exists() else b""
         if not content or content.endswith(b"\n"):
             return
         start = content.rfind(b"\n") + 1
-        with self.path.open("ab") as file:
+        with os.fdopen(open_regular(self.path, os.O_WRONLY | os.O_APPEND), "ab") as file:
             if _whole(content[start:]):
                 file.write(b"\n")
             else:

@@ -22,6 +22,7 @@ from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
+from vecenv_eval.store.files import open_regular, read_regular
 from vecenv_eval.store.record import StoreError
 
 LOCK, HOST = ".lock", ".lock.host"
@@ -54,7 +55,7 @@ def writing(folder: Path) -> Iterator[None]:
     with ExitStack() as stack:
         stack.callback(_HELD.pop, key, None)
         try:
-            handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+            handle = open_regular(folder / LOCK, os.O_RDWR | os.O_CREAT)
         except OSError as error:
             raise StoreError(f"{folder} cannot be written: {error.strerror}") from None
         stack.callback(os.close, handle)
@@ -110,12 +111,12 @@ def _mark_host(folder: Path) -> None:
     try:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
     except FileExistsError:
-        holder = _text(path.read_bytes()[:_MOST])
+        holder = _text(read_regular(path, _MOST))
         if f" on {platform.node()} since " not in holder:
             raise StoreError(
                 f"{folder} is in use: {holder or 'another machine'} writes to it; if that runs no more, remove {path}"
             ) from None
-        handle = os.open(path, os.O_RDWR)
+        handle = open_regular(path, os.O_RDWR)
     except OSError as error:
         raise StoreError(f"{path} cannot be written: {error.strerror}") from None
     try:

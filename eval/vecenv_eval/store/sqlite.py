@@ -70,6 +70,8 @@ _TIMEOUT_S, _WRITER_S = 30.0, 5.0
 _PATIENCE_S = 3600.0
 # Seconds for reading all rows, and bytes of one value: beyond any run's, so that a stranger's database is no trap.
 _READING_S, _MOST_BYTES = 300.0, 1 << 26
+# Of the names of SQLite's files.
+_ENDINGS = ("", "-wal", "-shm", "-journal")
 _BUSY = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
 _log = logging.getLogger(__name__)
 
@@ -160,7 +162,7 @@ class SqliteRows:
     def remove(self) -> None:
         """Delete the database, and its log and journal."""
         self.close()
-        for ending in ("", "-wal", "-shm", "-journal"):
+        for ending in _ENDINGS:
             self.path.with_name(self.path.name + ending).unlink(missing_ok=True)
 
     def _patiently(self, work: Callable[[], object]) -> None:
@@ -178,6 +180,7 @@ class SqliteRows:
     def _writer(self) -> sqlite3.Connection:
         """The connection that writes, with a table to write to."""
         if self._connection is None:
+            self._require_files()
             connection = sqlite3.connect(self.path, timeout=_WRITER_S, check_same_thread=False)
             try:
                 self.journal = _set_journal(connection, self.journal)
@@ -195,6 +198,7 @@ class SqliteRows:
 
     def _reader(self) -> sqlite3.Connection:
         """A connection that changes nothing."""
+        self._require_files()
         uri = f"{self.path.resolve().as_uri()}?mode=ro"
         connection = sqlite3.connect(uri, uri=True, timeout=_TIMEOUT_S)
         try:
@@ -211,6 +215,13 @@ class SqliteRows:
             else:
                 connection = sqlite3.connect(f"{uri}&immutable=1", uri=True)
         return _limited(connection)
+
+    def _require_files(self) -> None:
+        """Refuse a database that SQLite would follow to another place, or wait for."""
+        for ending in _ENDINGS:
+            path = self.path.with_name(self.path.name + ending)
+            if path.is_symlink() or (path.exists() and not path.is_file()):
+                raise StoreError(f"{path} is a link or no regular file: put the database itself there")
 
     def _reader_of_copy(self, log: Path) -> sqlite3.Connection:
         """A connection to a copy in memory of the database and its log."""
@@ -234,6 +245,8 @@ class SqliteRows:
             return False
         if "episodes" not in tables:
             raise StoreError(f"{self.path} is a database without a table of episodes")
+        if any(connection.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'")):
+            raise StoreError(f"{self.path} has triggers, which could change or remove rows: it is not a run's database")
         if version != SCHEMA:
             raise StoreError(f"{self.path} has version {version} of the table of episodes; this vecenv reads {SCHEMA}")
         return True

@@ -1,7 +1,7 @@
 """Programs that try to get out of the sandbox or to use up the machine, by what they use for it, and who watches them.
 
 ``tests/data/hostile`` has a file for each construct: the rule that programs break, "" for those that run to their end,
-and the programs. Those of ``sources`` are made by ``support.hostile.sources``, because they are long.
+and the programs. The long ones of ``sources`` are made by ``support.hostile.sources``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ LIMITS = frozenset({"steps", "time", "memory", "calls", "size", "nesting"})
 
 def programs(construct: str) -> dict[str, str]:
     """Source -> the rule that it breaks, of one construct."""
-    if construct == "sources":
-        return {source: rule for rule, source in SOURCES}
     by_rule = json.loads((DATA / "hostile" / f"{construct}.json").read_text())
-    return {source: rule for rule, sources in by_rule.items() for source in sources}
+    made = {source: rule for rule, source in SOURCES} if construct == "sources" else {}
+    return made | {source: rule for rule, sources in by_rule.items() for source in sources}
 
 
 def heavy(world: str) -> list[str]:
