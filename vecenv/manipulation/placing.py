@@ -173,10 +173,14 @@ def _room_ahead(pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gr
     return float(clearance(here, local, gripper)[0])
 
 
-def _reaches(world: SceneGeometry, pos: np.ndarray, rotation: np.ndarray) -> bool:
-    """Whether the arm can take a pose; True for an arm that is not known."""
+def _reaches(world: SceneGeometry, pos: np.ndarray, rotation: np.ndarray, spare: float = 0.0) -> bool:
+    """Whether the arm can take a pose, and one farther out by ``spare`` metres; True for an arm that is not known."""
     base = world.snapshot.panda_base
-    return base is None or bool(PandaArm(base).reaches(pos[None], rotation[None])[0])
+    if base is None:
+        return True
+    out = np.append(pos[:2] - base[:2], 0.0)
+    farther = pos + spare * out / max(float(np.linalg.norm(out)), 1e-9)
+    return bool(PandaArm(base).reaches(np.stack([pos, farther]), np.stack([rotation, rotation])).all())
 
 
 def _first_reached(world: SceneGeometry, score: np.ndarray, pos: np.ndarray, rotations: np.ndarray) -> int:
@@ -288,7 +292,8 @@ def _put_down_leaning(
 ) -> tuple[np.ndarray, np.ndarray]:
     """As :func:`put_down` where the arm cannot take the pose: hand and object lean away from the robot.
 
-    Let go, the object tips back on its base.
+    Let go, the object tips back on its base. Leans that leave the arm some reach come first: an arm that is stretched
+    out swings its elbow past straight, where it no longer folds.
     """
     pos, rotation = upright_hand
     if world.base is None:
@@ -302,9 +307,11 @@ def _put_down_leaning(
         for xy, cost in zip(target.xy, target.cost + tilt / world.config.tilt_scale, strict=True):
             end, extra = _put_down_at(world, name, target, xy, lean @ turn)
             options.append((cost + extra, end, lean @ rotation))
-    for _, end, hand in sorted(options, key=lambda option: option[0]):
-        if _reaches(world, end, hand):
-            return end, hand
+    options.sort(key=lambda option: option[0])
+    for spare in (world.config.spare_reach, 0.0):
+        for _, end, hand in options:
+            if _reaches(world, end, hand, spare):
+                return end, hand
     return upright_hand
 
 

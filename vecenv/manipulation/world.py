@@ -51,6 +51,7 @@ class Margins:
         grasp_tilts: of a hand from the vertical, tried where no upright one has room to grasp, radians.
         place_tilts: of a hand that leans away from the robot to put something down where an upright one does not reach,
             radians.
+        spare_reach: a hand that leans to put something down keeps this far from the end of the reach, where it can.
         rim_scale: at a rim, standing out this much further is worth one point.
         tilt_scale: at a rim, and where it leans to put something down, leaning this much more costs one point, radians.
         entry_tilts: of a hand that enters a space from a side, from the vertical, radians.
@@ -84,7 +85,8 @@ class Margins:
     widest_turn: float = 1.75
     overhang_scale: float = 0.005
     grasp_tilts: tuple[float, ...] = ()
-    place_tilts: tuple[float, ...] = (0.2, 0.35, 0.5)
+    place_tilts: tuple[float, ...] = (0.2, 0.35, 0.5, 0.7)
+    spare_reach: float = 0.04
     rim_scale: float = 0.001
     tilt_scale: float = 0.2
     entry_tilts: tuple[float, ...] = (1.4, 1.1, 0.8)
