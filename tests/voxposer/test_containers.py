@@ -91,6 +91,41 @@ def test_the_corner_is_a_field_of_a_container() -> None:
     assert (table.corner_position == table.place_position).all()
 
 
+def on_a_stove(at: float) -> Perception:
+    """A view with a block in the hand, a stove 20 cm wide, and another block on it at a y of ``at``."""
+    first, burner = box((0.03, 0.03, 0.03), (0.0, at, 0.05)), box((0.1, 0.1, 0.01), (0.0, 0.2, 0.01), 1200)
+    region = RegionBox(np.array([0.0, 0.2, 0.01]), np.eye(3), np.array([0.1, 0.1, 0.01]), "stove_1")
+    seen = carrying((0.025, 0.02, 0.05), first_1=first, stove_1=burner)
+    seen = replace(seen, parts={"stove_1_burner": Part("stove_1", "top", burner, region)})
+    return Perception(seen, HandState(seen.ee_pose, HOME, closed=True))
+
+
+def test_each_half_of_a_top_is_a_place_of_its_own() -> None:
+    """What stands on the left half is no reason to let go higher over the right half, as it is over the middle."""
+    view = on_a_stove(at=0.15)
+    burner = view.detect("stove_1_burner")
+    left, right = (view.position_of(burner[f"{side}_position"]) for side in ("left", "right"))
+    assert right[2] - 0.05 == pytest.approx(0.02, abs=0.01)  # its underside is on the burner
+    assert 0.22 <= right[1] <= 0.28
+    assert left[1] < 0.2 < right[1]
+    assert left[2] > right[2] + 0.04
+    np.testing.assert_allclose(matrix(burner.right_quat), DOWN, atol=1e-6)
+
+
+def test_halves_of_a_place_are_beside_each_other_with_an_empty_hand() -> None:
+    seen = replace(on_a_stove(at=0.15).snapshot, gripper=np.array([0.04, -0.04]))
+    burner = Perception(seen, HandState(seen.ee_pose, HOME)).detect("stove_1_burner")
+    assert burner.left_position[1] < burner.place_position[1] < burner.right_position[1]
+    assert burner.left_position[2] == burner.right_position[2] == burner.place_position[2]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_map_programs_know_the_halves(side: str) -> None:
+    half = f"the {side} side of the flat_stove_1_burner"
+    assert f"burner.{side}_position" in write_affordance(f"the place position of {half}")
+    assert f"burner.{side}_quat" in write_rotation(f"the placing orientation of {half}")
+
+
 def test_the_first_of_two_things_is_put_into_the_corner() -> None:
     names = ["soup_1", "sauce_1", "basket_1", "basket_1_inside"]
     program = write_planner("put both the soup and the sauce in the basket", names)

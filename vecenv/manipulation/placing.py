@@ -31,7 +31,7 @@ class Target:
         centre, half: a box to fit in, horizontally, [2] each; None where there is none.
         entry: the way out of a space that is entered from a side, horizontal unit vector [3]; None for one that is
             entered from above.
-        roof: height of the underside of what covers such a space, metres.
+        roof: height of the underside of what covers such a space, or a drawer that is shut, metres.
     """
 
     xy: np.ndarray
@@ -222,6 +222,9 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
     if target.entry is not None:
         return put_in(world, name, target, target.entry)
     rotation = upright(world.hand_rotation) if world.hand_rotation[2, 2] < -0.98 else world.hand_rotation
+    laid = _laid_down(world, name, target)
+    if laid is not None:
+        return laid
     best, lowest = (world.hand, rotation), np.inf
     for angle in _turns(world, name, target, rotation):
         places, costs = _with_corners(world, name, target, spun(np.eye(3), angle))
@@ -232,6 +235,76 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
             if cost + extra < lowest:
                 best, lowest = (end, spun(rotation, angle)), cost + extra
     return best if _reaches(world, *best) else _put_down_leaning(world, name, target, best)
+
+
+def _laid_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarray, np.ndarray] | None:
+    """Pose of the hand, position [3] and rotation [3, 3], from which an object tips over and lies down in a space.
+
+    The object leans with its base ahead, so far that its middle is not above its base, in a plane that the fingers do
+    not close across. None for what may stand in the space, does not tip over by itself or has no room to lie; and
+    where the arm or the scene leave the hand no room.
+
+    Args:
+        world: the scene.
+        name: the held object, which stands where an upright hand holds it.
+        target: a space that is open to above.
+    """
+    config, rotation = world.config, upright(world.hand_rotation)
+    erect = rotation @ world.hand_rotation.T
+    points = (world.points(name) - world.hand) @ erect.T
+    size, bottom = np.ptp(points, axis=0), points[:, 2].min()
+    if target.half is None or target.centre is None or size[2] < target.roof - target.floor + config.too_tall:
+        return None
+    wide = float(np.ptp(points[points[:, 2] < bottom + config.touchdown], axis=0)[:2].max())
+    tilt = float(np.arctan2(wide / 2, points[:, 2].mean() - bottom)) + config.tipped
+    if tilt > max(config.place_tilts):
+        return None
+    origin = erect @ (world.snapshot.poses[name][:3] - world.hand)
+    best, most = None, -np.inf
+    for angle in (0.0, np.pi / 2, -np.pi / 2):
+        hand = spun(rotation, angle)
+        for ahead in (hand[:, 0], -hand[:, 0]) if abs(float(yaw(hand))) < config.widest_turn else ():
+            lying = (np.abs(ahead[:2]) * size[2] + np.abs(ahead[[1, 0]]) * wide) / 2
+            spare = target.half - lying
+            if (spare < 0).any():
+                continue
+            heading = float(np.arctan2(ahead[1], ahead[0]))
+            turn = spun(leaning(tilt), heading) @ spun(np.eye(3), angle - heading)
+            for aside in np.linspace(-1, 1, 5):
+                base = target.centre + ahead[:2] * size[2] / 2 + aside * np.abs(ahead[[1, 0]]) * spare
+                over = base - (turn @ origin)[:2]
+                for score, pos in _over_a_floor(world, name, target, over, points @ turn.T, turn @ rotation):
+                    if score > most and _reaches(world, pos, turn @ rotation):
+                        best, most = (pos, turn @ rotation), score
+    return best
+
+
+def _over_a_floor(
+    world: SceneGeometry, name: str, target: Target, over: np.ndarray, held: np.ndarray, rotation: np.ndarray
+) -> list[tuple[float, np.ndarray]]:
+    """Positions [3] of a hand over a place [2] from which what it holds falls on the floor of a space, and scores.
+
+    Args:
+        world: the scene.
+        name: the held object.
+        target: the space.
+        over: where the hand is, horizontally.
+        held: points of the object relative to the hand, turned as at the release, [N, 3].
+        rotation: of the hand, [3, 3].
+    """
+    config = world.config
+    obstacles = around(over, np.concatenate([world.others(name), world.walls]), 2 * config.neighbours)
+    at = np.append(over, target.floor)
+    at[2] += _rest(held + at, obstacles, target.floor, config)
+    if at[2] + held[:, 2].min() > target.floor + config.stacked:
+        return []
+    found = []
+    for lift in np.arange(0.0, config.highest_drop + 0.005, 0.01):
+        pos = at + [0.0, 0.0, lift]
+        room = room_around(pos, rotation, obstacles, config.gripper)
+        if room > 0:
+            found.append((min(room, config.ample_room) / config.room_scale - config.drop_cost * lift, pos))
+    return found
 
 
 def put_in_corner(
@@ -327,16 +400,35 @@ def put_in(world: SceneGeometry, name: str, target: Target, out: np.ndarray) -> 
     config = world.config
     obstacles = np.concatenate([world.others(name), world.walls])
     obstacles = obstacles[np.linalg.norm(obstacles[:, :2] - target.xy[0], axis=1) < 2 * config.neighbours]
-    best, highest = (world.hand, world.hand_rotation), -np.inf
+    options = []
     for rotation in _entering(out, config):
         pos, room = _put_in_at(world, name, target, rotation, obstacles)
-        ways = [pos + back * out for back in (0.0, 0.05, 0.10)]
-        free = min(room, *(room_around(way, rotation, obstacles, config.gripper) for way in ways))
+        short, free = _stopping_short(pos, rotation, out, obstacles, target, config)
         turned = np.arccos(np.clip((np.trace(rotation @ world.hand_rotation.T) - 1) / 2, -1, 1))
-        score = min(free, config.ample_room) / config.room_scale - turned / config.turn_scale
-        if score > highest:
-            best, highest = (pos, rotation), score
-    return best
+        score = min(room, free, config.ample_room) / config.room_scale - turned / config.turn_scale
+        tips = np.pi / 2 - np.arccos(np.clip(-rotation[2, 2], -1, 1))  # how far it turns when it is let go of
+        options.append((score - (short + config.tipping * tips) / config.short_scale, pos + short * out, rotation))
+    options.sort(key=lambda option: -option[0])
+    reached = (option[1:] for option in options if _reaches(world, *option[1:]))
+    return next(reached, options[0][1:])
+
+
+def _stopping_short(
+    pos: np.ndarray, rotation: np.ndarray, out: np.ndarray, obstacles: np.ndarray, target: Target, config: Margins
+) -> tuple[float, float]:
+    """How far before a place in a space a hand stops, metres, and the room that it has there and on its way in.
+
+    None if it has room all the way; else the least with which it has, up to where the middle of what it holds is still
+    inside the space: the palm may be wider than the opening.
+    """
+    step, way = 0.01, 10
+    depth = 0.0 if target.half is None else float(np.abs(out[:2]) @ target.half)
+    count = int(max(depth - config.edge_inside, 0.0) / step) + 1
+    rooms = np.array([room_around(pos + i * step * out, rotation, obstacles, config.gripper) for i in range(count + way)])
+    free = np.array([rooms[i : i + way + 1].min() for i in range(count)])
+    enough = np.flatnonzero(free > 0.0)
+    i = int(enough[0]) if len(enough) else int(free.argmax())
+    return i * step, float(free[i])
 
 
 def _entering(out: np.ndarray, config: Margins) -> list[np.ndarray]:

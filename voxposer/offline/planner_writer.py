@@ -20,8 +20,9 @@ from voxposer.offline.references import Moves
 
 # Distances named in subtasks, centimetres: over a target before the last descent; before a target that is entered
 # from a side; after grasping and releasing; the way of a drawer, which stops at its end by itself; a step of a door;
-# room kept from what is to be avoided; the longest distance that fits on a table.
-ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID, FARTHEST = 10, 20, 10, 18, 22, 10, 15, 100
+# room kept from what is to be avoided; the longest distance that fits on a table; and how far fingers sink that have let
+# go of something in a space, which may have tipped over onto them and would come out with them.
+ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID, FARTHEST, SINK = 10, 20, 10, 18, 22, 10, 15, 100, 4
 # Steps that take a door through its range.
 DOOR_STEPS = 6
 # Objects that "to" puts things into, and those it puts things next to: all that are not supports.
@@ -451,7 +452,8 @@ def _goal(place: Place, words: str, arrived: str = "") -> list[str]:
         return [f"move to {ABOVE}cm above the table {goal} {words}", f"place it {goal} {arrived}", *_LEAVE]
     word = "in" if place.relation == "in" else "on"
     if words.endswith(("_inside", "_level")):
-        return [f"move to {BEFORE}cm in front of {words}", f"place it {word} {words}", *_back_from(words, BEFORE)]
+        there = [f"move to {BEFORE}cm in front of {words}", f"place it {word} {words}"]
+        return [*there, f"move down by {SINK}cm", *_back_from(words, BEFORE)]
     return [f"move to {ABOVE}cm above {words}", f"place it {word} {arrived}", *_LEAVE]
 
 

@@ -91,7 +91,9 @@ class PlaceFinder:
         out = exit_direction(part, self.scene) if part.kind == "space" else np.array([0.0, 0.0, 1.0])
         if out[2] > 0.5:
             floor = max(part.box.pos[2] - half[2], self.scene.ground(part.box.pos[:2]))
-            return Target(xy, cost, floor=floor, centre=part.box.pos[:2], half=half[:2])
+            # What is to be shut has to take all of what is put into it.
+            roof = np.inf if part.joint is None else float(part.box.pos[2] + half[2])
+            return Target(xy, cost, floor=floor, centre=part.box.pos[:2], half=half[:2], roof=roof)
         low, high = cavity(part, self.scene)
         middle = (low + high)[:2] / 2
         return Target(
