@@ -76,6 +76,36 @@ def test_an_object_without_room_on_the_floor_goes_where_it_tips_over() -> None:
     assert over.max() > 0.0  # its middle is not above the other
 
 
+def drawer(wide: float, shut: float) -> Target:
+    """The space of a drawer 24 cm long that is shut at a height; without its walls."""
+    return Target(CENTRE[None], np.zeros(1), floor=0.0, centre=CENTRE, half=np.array([0.12, wide]), roof=shut)
+
+
+def test_what_is_too_tall_for_a_drawer_leans_so_that_it_tips_over_and_lies_in_it() -> None:
+    world = scene(carrying((0.02, 0.02, 0.08)))
+    pos, rotation = put_down(world, "held_1", drawer(wide=0.05, shut=0.06))
+    turn = rotation @ DOWN.T
+    standing = (world.points("held_1") - world.hand) @ turn.T + pos
+    way = turn @ np.array([0.0, 0.0, 1.0])  # of its top
+    assert np.arccos(way[2]) > np.arctan2(0.02, 0.08) + 0.2
+    assert abs(way[1]) < 1e-6  # along the drawer, and not across the fingers, which close along y
+    base = standing[standing[:, 2] < standing[:, 2].min() + 0.03].mean(axis=0)
+    lying = base[:2] + way[:2] / np.linalg.norm(way[:2]) * 0.08
+    np.testing.assert_allclose(lying, CENTRE, atol=0.04)
+    assert standing[:, 2].min() < 0.09
+
+
+def test_what_may_stand_or_does_not_tip_over_or_cannot_lie_is_put_down_upright() -> None:
+    slim, wide = carrying((0.02, 0.02, 0.08)), carrying((0.04, 0.03, 0.06))
+    for seen, space in (
+        (slim, drawer(wide=0.05, shut=np.inf)),
+        (slim, drawer(wide=0.01, shut=0.06)),
+        (wide, drawer(wide=0.05, shut=0.06)),
+    ):
+        _, rotation = put_down(scene(seen), "held_1", space)
+        assert rotation[2, 2] < -0.99
+
+
 def test_the_corner_is_a_field_of_a_container() -> None:
     basket = box((0.07, 0.07, 0.004), (0.0, 0.2, 0.004))
     region = RegionBox(np.array([0.0, 0.2, 0.05]), np.eye(3), np.array([0.06, 0.06, 0.05]), "basket_1")

@@ -145,7 +145,7 @@ def test_a_hand_that_leans_keeps_reach_to_spare() -> None:
         ee_pose=np.array([0.0, 0.0, 0.10, *HOME[3:]]),
         gripper=np.array([0.02, -0.02]),
     )
-    target, farther = Target(np.array([[0.22, 0.0]]), np.zeros(1), floor=0.0), np.array([[0.04, 0.0, 0.0]])
+    target, farther = Target(np.array([[0.24, 0.0]]), np.zeros(1), floor=0.0), np.array([[0.04, 0.0, 0.0]])
     careless = SceneGeometry(held, Margins(gripper=PINCHERS, spare_reach=0.0), BASE[:2])
     for world, spared in ((geometry(held), True), (careless, False)):
         pos, rotation = put_down(world, "can_1", target)
@@ -217,6 +217,7 @@ def test_a_hand_turns_where_the_arm_can_take_its_rotation() -> None:
         ("libero_10_swap", 8),  # two pots on the halves of a burner at the end of the reach
         ("libero_spatial_task", 0),  # "not between"
         ("libero_10_object", 7),  # a larger can and a box in one basket
+        ("libero_10_task", 3),  # a bottle that has to lie in a drawer
         ("libero_10_task", 7),  # a bottle and a box in one basket
         ("libero_10_task", 9),  # a mug into a microwave whose opening is narrower than the palm
     ],

@@ -13,35 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.manipulation.grasps import Grasps, Gripper, clearance, find_grasps, room_around
+from vecenv.manipulation.entering import put_in
+from vecenv.manipulation.grasps import Grasps, Gripper, clearance, find_grasps
+from vecenv.manipulation.laying import laid_down
 from vecenv.manipulation.reach import PandaArm
 from vecenv.manipulation.rims import find_rim_grasps
+from vecenv.manipulation.targets import Target, can_take, rest_move
 from vecenv.manipulation.world import Margins, SceneGeometry, around, down_facing, leaning, spun, upright, yaw
-
-
-@dataclass(frozen=True)
-class Target:
-    """Candidates for an object's origin.
-
-    Attributes:
-        xy: candidates, world frame, [M, 2].
-        cost: what each costs, ascending, [M].
-        floor: height that carries it whatever the points say, metres.
-        ignored: objects whose points are no obstacle.
-        centre, half: a box to fit in, horizontally, [2] each; None where there is none.
-        entry: the way out of a space that is entered from a side, horizontal unit vector [3]; None for one that is
-            entered from above.
-        roof: height of the underside of what covers such a space, or a drawer that is shut, metres.
-    """
-
-    xy: np.ndarray
-    cost: np.ndarray
-    floor: float
-    ignored: tuple[str, ...] = ()
-    centre: np.ndarray | None = None
-    half: np.ndarray | None = None
-    entry: np.ndarray | None = None
-    roof: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -173,16 +151,6 @@ def _room_ahead(pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gr
     return float(clearance(here, local, gripper)[0])
 
 
-def _reaches(world: SceneGeometry, pos: np.ndarray, rotation: np.ndarray, spare: float = 0.0) -> bool:
-    """Whether the arm can take a pose, and one farther out by ``spare`` metres; True for an arm that is not known."""
-    base = world.snapshot.panda_base
-    if base is None:
-        return True
-    out = np.append(pos[:2] - base[:2], 0.0)
-    farther = pos + spare * out / max(float(np.linalg.norm(out)), 1e-9)
-    return bool(PandaArm(base).reaches(np.stack([pos, farther]), np.stack([rotation, rotation])).all())
-
-
 def _first_reached(world: SceneGeometry, score: np.ndarray, pos: np.ndarray, rotations: np.ndarray) -> int:
     """Row of the best hand that the arm can take; of the best one if it can take none, or if the arm is not known."""
     best = int(score.argmax())
@@ -222,7 +190,7 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
     if target.entry is not None:
         return put_in(world, name, target, target.entry)
     rotation = upright(world.hand_rotation) if world.hand_rotation[2, 2] < -0.98 else world.hand_rotation
-    laid = _laid_down(world, name, target)
+    laid = laid_down(world, name, target)
     if laid is not None:
         return laid
     best, lowest = (world.hand, rotation), np.inf
@@ -234,77 +202,7 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
             end, extra = _put_down_at(world, name, target, xy, spun(np.eye(3), angle))
             if cost + extra < lowest:
                 best, lowest = (end, spun(rotation, angle)), cost + extra
-    return best if _reaches(world, *best) else _put_down_leaning(world, name, target, best)
-
-
-def _laid_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pose of the hand, position [3] and rotation [3, 3], from which an object tips over and lies down in a space.
-
-    The object leans with its base ahead, so far that its middle is not above its base, in a plane that the fingers do
-    not close across. None for what may stand in the space, does not tip over by itself or has no room to lie; and
-    where the arm or the scene leave the hand no room.
-
-    Args:
-        world: the scene.
-        name: the held object, which stands where an upright hand holds it.
-        target: a space that is open to above.
-    """
-    config, rotation = world.config, upright(world.hand_rotation)
-    erect = rotation @ world.hand_rotation.T
-    points = (world.points(name) - world.hand) @ erect.T
-    size, bottom = np.ptp(points, axis=0), points[:, 2].min()
-    if target.half is None or target.centre is None or size[2] < target.roof - target.floor + config.too_tall:
-        return None
-    wide = float(np.ptp(points[points[:, 2] < bottom + config.touchdown], axis=0)[:2].max())
-    tilt = float(np.arctan2(wide / 2, points[:, 2].mean() - bottom)) + config.tipped
-    if tilt > max(config.place_tilts):
-        return None
-    origin = erect @ (world.snapshot.poses[name][:3] - world.hand)
-    best, most = None, -np.inf
-    for angle in (0.0, np.pi / 2, -np.pi / 2):
-        hand = spun(rotation, angle)
-        for ahead in (hand[:, 0], -hand[:, 0]) if abs(float(yaw(hand))) < config.widest_turn else ():
-            lying = (np.abs(ahead[:2]) * size[2] + np.abs(ahead[[1, 0]]) * wide) / 2
-            spare = target.half - lying
-            if (spare < 0).any():
-                continue
-            heading = float(np.arctan2(ahead[1], ahead[0]))
-            turn = spun(leaning(tilt), heading) @ spun(np.eye(3), angle - heading)
-            for aside in np.linspace(-1, 1, 5):
-                base = target.centre + ahead[:2] * size[2] / 2 + aside * np.abs(ahead[[1, 0]]) * spare
-                over = base - (turn @ origin)[:2]
-                for score, pos in _over_a_floor(world, name, target, over, points @ turn.T, turn @ rotation):
-                    if score > most and _reaches(world, pos, turn @ rotation):
-                        best, most = (pos, turn @ rotation), score
-    return best
-
-
-def _over_a_floor(
-    world: SceneGeometry, name: str, target: Target, over: np.ndarray, held: np.ndarray, rotation: np.ndarray
-) -> list[tuple[float, np.ndarray]]:
-    """Positions [3] of a hand over a place [2] from which what it holds falls on the floor of a space, and scores.
-
-    Args:
-        world: the scene.
-        name: the held object.
-        target: the space.
-        over: where the hand is, horizontally.
-        held: points of the object relative to the hand, turned as at the release, [N, 3].
-        rotation: of the hand, [3, 3].
-    """
-    config = world.config
-    obstacles = around(over, np.concatenate([world.others(name), world.walls]), 2 * config.neighbours)
-    at = np.append(over, target.floor)
-    at[2] += _rest(held + at, obstacles, target.floor, config)
-    if at[2] + held[:, 2].min() > target.floor + config.stacked:
-        return []
-    found = []
-    for lift in np.arange(0.0, config.highest_drop + 0.005, 0.01):
-        pos = at + [0.0, 0.0, lift]
-        room = room_around(pos, rotation, obstacles, config.gripper)
-        if room > 0:
-            found.append((min(room, config.ample_room) / config.room_scale - config.drop_cost * lift, pos))
-    return found
+    return best if can_take(world, *best) else _put_down_leaning(world, name, target, best)
 
 
 def put_in_corner(
@@ -331,7 +229,7 @@ def put_in_corner(
         far = 0.0 if world.base is None else float(np.linalg.norm(at[:2] - world.base))
         options.append((round(cost, 2), -far, at))
     for _, _, at in sorted(options, key=lambda option: option[:2]):
-        if _reaches(world, at, rotation):
+        if can_take(world, at, rotation):
             return at
     return middle
 
@@ -383,82 +281,9 @@ def _put_down_leaning(
     options.sort(key=lambda option: option[0])
     for spare in (world.config.spare_reach, 0.0):
         for _, end, hand in options:
-            if _reaches(world, end, hand, spare):
+            if can_take(world, end, hand, spare):
                 return end, hand
     return upright_hand
-
-
-def put_in(world: SceneGeometry, name: str, target: Target, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`put_down`, into a space that is entered from a side: the fingers lead, and the object turns along.
-
-    Args:
-        world: the scene.
-        name: the held object.
-        target: a space with a box to fit in.
-        out: direction out of it, horizontal unit vector [3].
-    """
-    config = world.config
-    obstacles = np.concatenate([world.others(name), world.walls])
-    obstacles = obstacles[np.linalg.norm(obstacles[:, :2] - target.xy[0], axis=1) < 2 * config.neighbours]
-    options = []
-    for rotation in _entering(out, config):
-        pos, room = _put_in_at(world, name, target, rotation, obstacles)
-        short, free = _stopping_short(pos, rotation, out, obstacles, target, config)
-        turned = np.arccos(np.clip((np.trace(rotation @ world.hand_rotation.T) - 1) / 2, -1, 1))
-        score = min(room, free, config.ample_room) / config.room_scale - turned / config.turn_scale
-        tips = np.pi / 2 - np.arccos(np.clip(-rotation[2, 2], -1, 1))  # how far it turns when it is let go of
-        options.append((score - (short + config.tipping * tips) / config.short_scale, pos + short * out, rotation))
-    options.sort(key=lambda option: -option[0])
-    reached = (option[1:] for option in options if _reaches(world, *option[1:]))
-    return next(reached, options[0][1:])
-
-
-def _stopping_short(
-    pos: np.ndarray, rotation: np.ndarray, out: np.ndarray, obstacles: np.ndarray, target: Target, config: Margins
-) -> tuple[float, float]:
-    """How far before a place in a space a hand stops, metres, and the room that it has there and on its way in.
-
-    None if it has room all the way; else the least with which it has, up to where the middle of what it holds is still
-    inside the space: the palm may be wider than the opening.
-    """
-    step, way = 0.01, 10
-    depth = 0.0 if target.half is None else float(np.abs(out[:2]) @ target.half)
-    count = int(max(depth - config.edge_inside, 0.0) / step) + 1
-    rooms = np.array([room_around(pos + i * step * out, rotation, obstacles, config.gripper) for i in range(count + way)])
-    free = np.array([rooms[i : i + way + 1].min() for i in range(count)])
-    enough = np.flatnonzero(free > 0.0)
-    i = int(enough[0]) if len(enough) else int(free.argmax())
-    return i * step, float(free[i])
-
-
-def _entering(out: np.ndarray, config: Margins) -> list[np.ndarray]:
-    """Hands that lead with their fingers against ``out``: how level they are, and the four turns about their axis."""
-    side = np.cross([0.0, 0.0, 1.0], out)
-    hands = []
-    for tilt in config.entry_tilts:
-        z = -np.sin(tilt) * out - np.cos(tilt) * np.array([0.0, 0.0, 1.0])
-        across = np.cross(z, side)
-        hands += [np.stack([np.cross(y, z), y, z], axis=1) for y in (side, -side, across, -across)]
-    return hands
-
-
-def _put_in_at(
-    world: SceneGeometry, name: str, target: Target, rotation: np.ndarray, obstacles: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Position [3] at which a hand so rotated stands the object in the middle of a space; and the room above it.
-
-    The hand may need more height than the object.
-    """
-    config = world.config
-    hung = (world.points(name) - world.hand) @ (rotation @ world.hand_rotation.T).T
-    low, high = hung.min(axis=0), hung.max(axis=0)
-    height = target.floor + config.touchdown - low[2]
-    pos = np.append(target.xy[0] - (low + high)[:2] / 2, height)
-    lifts = np.arange(0.0, max(target.roof - high[2] - height, 0.0) + 0.005, 0.01)
-    rooms = [room_around(pos + [0.0, 0.0, lift], rotation, obstacles, config.gripper) for lift in lifts]
-    enough = np.flatnonzero(np.array(rooms) > config.least_room)
-    lift = float(lifts[int(enough[0]) if len(enough) else int(np.argmax(rooms))])
-    return pos + [0.0, 0.0, lift], target.roof - (height + lift + float(high[2]))
 
 
 def _turns(world: SceneGeometry, name: str, target: Target, rotation: np.ndarray) -> list[float]:
@@ -482,7 +307,7 @@ def _put_down_at(
     near, walls = (
         around(middle, cloud, config.neighbours) for cloud in (world.others(name, *target.ignored), world.walls)
     )
-    resting = world.hand[2] + _rest(moved, near, target.floor, config)
+    resting = world.hand[2] + rest_move(moved, near, target.floor, config)
     axis = (turn @ upright(world.hand_rotation))[:, 1]
     height = _with_room(np.append(middle, resting), axis, np.concatenate([near, walls]), config)
     moved = moved + [0.0, 0.0, resting - world.hand[2]]
@@ -527,18 +352,6 @@ def _overhang(points: np.ndarray, target: Target) -> float:
     if target.half is None or target.centre is None:
         return 0.0
     return float((np.abs(points[:, :2] - target.centre) - target.half).max(initial=0.0))
-
-
-def _rest(points: np.ndarray, obstacles: np.ndarray, floor: float, config: Margins) -> float:
-    """Vertical move that brings points to rest on obstacles or on the floor, nearly touching."""
-    lift = floor - points[:, 2].min()
-    low, high = points[:, :2].min(axis=0) - config.support_radius, points[:, :2].max(axis=0) + config.support_radius
-    obstacles = obstacles[((obstacles[:, :2] > low) & (obstacles[:, :2] < high)).all(axis=1)]
-    if len(obstacles):
-        apart = np.linalg.norm(points[:, None, :2] - obstacles[None, :, :2], axis=2)
-        under = np.where(apart < config.support_radius, points[:, None, 2], np.inf).min(axis=0)
-        lift = max(lift, float((obstacles[:, 2] - under).max()))
-    return lift + config.touchdown
 
 
 def _with_room(hand: np.ndarray, axis: np.ndarray, obstacles: np.ndarray, config: Margins) -> float:

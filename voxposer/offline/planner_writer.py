@@ -20,9 +20,10 @@ from voxposer.offline.references import Moves
 
 # Distances named in subtasks, centimetres: over a target before the last descent; before a target that is entered
 # from a side; after grasping and releasing; the way of a drawer, which stops at its end by itself; a step of a door;
-# room kept from what is to be avoided; the longest distance that fits on a table; and how far fingers sink that have let
-# go of something in a space, which may have tipped over onto them and would come out with them.
-ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID, FARTHEST, SINK = 10, 20, 10, 18, 22, 10, 15, 100, 4
+# room kept from what is to be avoided; the longest distance that fits on a table.
+ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID, FARTHEST = 10, 20, 10, 18, 22, 10, 15, 100
+# How far fingers sink that let go of something in a space: tipped over onto them, it would come out with them.
+SINK = 4
 # Steps that take a door through its range.
 DOOR_STEPS = 6
 # Objects that "to" puts things into, and those it puts things next to: all that are not supports.
