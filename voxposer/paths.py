@@ -184,6 +184,8 @@ def _mapped(
     # Where the hand is to grasp or let go, it is meant to be in among things, whoever chose the place.
     last = then.closed_at_end(end) if then is not None and then.kind == "stay" else goal.closed
     exact = tuple(int(index) for index in end) in perception.exact or last != perception.closed
+    # So is a hand that moves by a little only: giving way to obstacles would take it farther than it was to go.
+    exact = exact or bool(np.linalg.norm(goal.pos - perception.ee.pos) < route.little)
     found = plan_mapped(perception, goal, closed=closed, exact=exact, **options)
     perception.turns[request] = found.turn
     return found

@@ -187,6 +187,10 @@ class ToyWorld:
                 "place_position": lambda: self.voxel(self._rest(name) + self._under()),
                 "place_quat": lambda: DOWN.copy(),
                 "corner_position": lambda: self.voxel(self._rest(name) + self._under()),
+                "left_position": lambda: self.voxel(self._rest(name) + self._under() + self._aside(name, -1.0)),
+                "left_quat": lambda: DOWN.copy(),
+                "right_position": lambda: self.voxel(self._rest(name) + self._under() + self._aside(name, 1.0)),
+                "right_quat": lambda: DOWN.copy(),
                 "push_quat": lambda: DOWN.copy(),
                 "hand_offset": lambda: self.voxel(self.ee) - self.voxel(self.ee - self._under()),
                 "normal": lambda: np.array([0.0, 0.0, 1.0]),
@@ -206,6 +210,10 @@ class ToyWorld:
         if part.kind == "knob":
             return opened + self.turned.get(name, 0.0) > 0.5 * part.joint.travel
         return self._drawn("open", f"{_stem(name)}_region")
+    def _aside(self, name: str, side: float) -> np.ndarray:
+        """From the middle of a thing to the middle of its left half (-1) or of its right one (1)."""
+        low, high = self.bounds(name)
+        return np.array([0.0, side * (high[1] - low[1]) / 4, 0.0])
 
     # -- language ------------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,8 @@ from support.voxposer_world import HOME, box, handle, snapshot, space
 import vecenv
 from vecenv.libero.env import LiberoEnv
 from vecenv.manipulation.grasps import Gripper, room_around
-from vecenv.manipulation.world import matrix
+from vecenv.manipulation.placing import Target, put_in
+from vecenv.manipulation.world import Margins, SceneGeometry, matrix
 from vecenv.observations import ObjectsSnapshot, Part, PartJoint, PointCloud, RegionBox
 from voxposer.perception.config import HandState
 from voxposer.perception.grid import VoxelGrid
@@ -303,6 +304,30 @@ def test_a_space_with_a_roof_is_entered_with_the_fingers_ahead() -> None:
     assert (np.abs(carried - OVEN) < [0.12, 0.09, 0.09]).all()
     shell = oven().objects["oven_1"].points
     assert all(room_around(pos + [0, -back, 0], hand, shell) > 0 for back in (0.0, 0.1))
+
+
+def test_a_hand_whose_palm_is_wider_than_an_opening_stops_short() -> None:
+    walls = [
+        box((0.01, 0.09, 0.09), OVEN + [-0.08, 0.0, 0.0], 900),
+        box((0.01, 0.09, 0.09), OVEN + [0.08, 0.0, 0.0], 900),
+        box((0.09, 0.09, 0.01), OVEN + [0.0, 0.0, 0.1], 900),
+        box((0.09, 0.09, 0.01), OVEN + [0.0, 0.0, -0.1], 900),
+        box((0.09, 0.01, 0.09), OVEN + [0.0, 0.1, 0.0], 900),
+    ]
+    shell = PointCloud(*(np.concatenate([getattr(wall, f) for wall in walls]) for f in ("points", "normals")))
+    seen = replace(oven(), objects={"cube_1": oven().objects["cube_1"], "oven_1": shell})
+    gripper = Gripper(wrist=0.14)
+    target = Target(
+        OVEN[None, :2], np.zeros(1), OVEN[2] - 0.09, centre=OVEN[:2], half=np.array([0.07, 0.09]), roof=OVEN[2] + 0.09
+    )
+    out = np.array([0.0, -1.0, 0.0])
+    pos, hand = put_in(SceneGeometry(seen, Margins(gripper=gripper)), "cube_1", target, out)
+    carried = (seen.objects["cube_1"].points - HOME[:3]) @ (hand @ matrix(HOME[3:]).T).T + pos
+    middle = float(carried[:, 1].mean())
+    assert OVEN[1] - 0.09 < middle < OVEN[1] - 0.02  # before the middle of the space, but inside
+    rooms = [room_around(pos + back * out, hand, shell.points, gripper) for back in np.arange(-0.06, 0.11, 0.02)]
+    assert min(rooms[3:]) > -0.002
+    assert rooms[0] < -0.01
 
 
 def test_room_is_measured_around_fingers_palm_and_wrist() -> None:

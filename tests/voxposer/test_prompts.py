@@ -46,7 +46,7 @@ CALLABLE = {
     "get_gripper_map": {*VOXELS, "get_empty_gripper_map"},
 }
 FIELDS = {"position", "aabb", "normal", "name", "held", "occupancy_map", "axis", "hand_offset"} | {
-    f"{what}_{kind}" for what in ("grasp", "place", "push") for kind in ("position", "quat")
+    f"{what}_{kind}" for what in ("grasp", "place", "left", "right", "push") for kind in ("position", "quat")
 }
 
 

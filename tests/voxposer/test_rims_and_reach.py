@@ -137,6 +137,22 @@ def test_a_hand_leans_to_put_down_what_an_upright_one_would_not_reach() -> None:
     assert rotation[0, 2] > 0.1  # away from the robot
 
 
+def test_a_hand_that_leans_keeps_reach_to_spare() -> None:
+    """Stretched out, the elbow of a Panda swings past straight, and its controller does not fold it again."""
+    can = box((0.02, 0.02, 0.06), (0.0, 0.0, 0.06))
+    held = replace(
+        snapshot({"can_1": can}, panda_base=BASE),
+        ee_pose=np.array([0.0, 0.0, 0.10, *HOME[3:]]),
+        gripper=np.array([0.02, -0.02]),
+    )
+    target, farther = Target(np.array([[0.24, 0.0]]), np.zeros(1), floor=0.0), np.array([[0.04, 0.0, 0.0]])
+    careless = SceneGeometry(held, Margins(gripper=PINCHERS, spare_reach=0.0), BASE[:2])
+    for world, spared in ((geometry(held), True), (careless, False)):
+        pos, rotation = put_down(world, "can_1", target)
+        assert PandaArm(BASE).reaches(pos[None], rotation[None])[0]
+        assert PandaArm(BASE).reaches(pos + farther, rotation[None])[0] == spared
+
+
 def look(seen: ObjectsSnapshot, at: tuple[float, float, float], *, closed: bool = False) -> Perception:
     pose = np.array([*at, *HOME[3:]])
     gripper = np.array([0.02, -0.02]) if closed else seen.gripper
@@ -198,9 +214,12 @@ def test_a_hand_turns_where_the_arm_can_take_its_rotation() -> None:
     [
         ("libero_goal_task", 1),  # a plate, by its rim
         ("libero_10_swap", 0),  # over a can next to the robot's base
+        ("libero_10_swap", 8),  # two pots on the halves of a burner at the end of the reach
         ("libero_spatial_task", 0),  # "not between"
         ("libero_10_object", 7),  # a larger can and a box in one basket
+        ("libero_10_task", 3),  # a bottle that has to lie in a drawer
         ("libero_10_task", 7),  # a bottle and a box in one basket
+        ("libero_10_task", 9),  # a mug into a microwave whose opening is narrower than the palm
     ],
 )
 def test_tasks_that_need_these_rules_are_solved(suite: str, task: int, tmp_path: Path) -> None:

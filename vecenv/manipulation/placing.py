@@ -13,35 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vecenv.manipulation.grasps import Grasps, Gripper, clearance, find_grasps, room_around
+from vecenv.manipulation.entering import put_in
+from vecenv.manipulation.grasps import Grasps, Gripper, clearance, find_grasps
+from vecenv.manipulation.laying import laid_down
 from vecenv.manipulation.reach import PandaArm
 from vecenv.manipulation.rims import find_rim_grasps
+from vecenv.manipulation.targets import Target, can_take, rest_move
 from vecenv.manipulation.world import Margins, SceneGeometry, around, down_facing, leaning, spun, upright, yaw
-
-
-@dataclass(frozen=True)
-class Target:
-    """Candidates for an object's origin.
-
-    Attributes:
-        xy: candidates, world frame, [M, 2].
-        cost: what each costs, ascending, [M].
-        floor: height that carries it whatever the points say, metres.
-        ignored: objects whose points are no obstacle.
-        centre, half: a box to fit in, horizontally, [2] each; None where there is none.
-        entry: the way out of a space that is entered from a side, horizontal unit vector [3]; None for one that is
-            entered from above.
-        roof: height of the underside of what covers such a space, metres.
-    """
-
-    xy: np.ndarray
-    cost: np.ndarray
-    floor: float
-    ignored: tuple[str, ...] = ()
-    centre: np.ndarray | None = None
-    half: np.ndarray | None = None
-    entry: np.ndarray | None = None
-    roof: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -173,12 +151,6 @@ def _room_ahead(pos: np.ndarray, rotation: np.ndarray, obstacles: np.ndarray, gr
     return float(clearance(here, local, gripper)[0])
 
 
-def _reaches(world: SceneGeometry, pos: np.ndarray, rotation: np.ndarray) -> bool:
-    """Whether the arm can take a pose; True for an arm that is not known."""
-    base = world.snapshot.panda_base
-    return base is None or bool(PandaArm(base).reaches(pos[None], rotation[None])[0])
-
-
 def _first_reached(world: SceneGeometry, score: np.ndarray, pos: np.ndarray, rotations: np.ndarray) -> int:
     """Row of the best hand that the arm can take; of the best one if it can take none, or if the arm is not known."""
     best = int(score.argmax())
@@ -218,6 +190,9 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
     if target.entry is not None:
         return put_in(world, name, target, target.entry)
     rotation = upright(world.hand_rotation) if world.hand_rotation[2, 2] < -0.98 else world.hand_rotation
+    laid = laid_down(world, name, target)
+    if laid is not None:
+        return laid
     best, lowest = (world.hand, rotation), np.inf
     for angle in _turns(world, name, target, rotation):
         places, costs = _with_corners(world, name, target, spun(np.eye(3), angle))
@@ -227,7 +202,7 @@ def put_down(world: SceneGeometry, name: str, target: Target) -> tuple[np.ndarra
             end, extra = _put_down_at(world, name, target, xy, spun(np.eye(3), angle))
             if cost + extra < lowest:
                 best, lowest = (end, spun(rotation, angle)), cost + extra
-    return best if _reaches(world, *best) else _put_down_leaning(world, name, target, best)
+    return best if can_take(world, *best) else _put_down_leaning(world, name, target, best)
 
 
 def put_in_corner(
@@ -254,7 +229,7 @@ def put_in_corner(
         far = 0.0 if world.base is None else float(np.linalg.norm(at[:2] - world.base))
         options.append((round(cost, 2), -far, at))
     for _, _, at in sorted(options, key=lambda option: option[:2]):
-        if _reaches(world, at, rotation):
+        if can_take(world, at, rotation):
             return at
     return middle
 
@@ -288,7 +263,8 @@ def _put_down_leaning(
 ) -> tuple[np.ndarray, np.ndarray]:
     """As :func:`put_down` where the arm cannot take the pose: hand and object lean away from the robot.
 
-    Let go, the object tips back on its base.
+    Let go, the object tips back on its base. Leans that leave the arm some reach come first: an arm that is stretched
+    out swings its elbow past straight, where it no longer folds.
     """
     pos, rotation = upright_hand
     if world.base is None:
@@ -302,64 +278,12 @@ def _put_down_leaning(
         for xy, cost in zip(target.xy, target.cost + tilt / world.config.tilt_scale, strict=True):
             end, extra = _put_down_at(world, name, target, xy, lean @ turn)
             options.append((cost + extra, end, lean @ rotation))
-    for _, end, hand in sorted(options, key=lambda option: option[0]):
-        if _reaches(world, end, hand):
-            return end, hand
+    options.sort(key=lambda option: option[0])
+    for spare in (world.config.spare_reach, 0.0):
+        for _, end, hand in options:
+            if can_take(world, end, hand, spare):
+                return end, hand
     return upright_hand
-
-
-def put_in(world: SceneGeometry, name: str, target: Target, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`put_down`, into a space that is entered from a side: the fingers lead, and the object turns along.
-
-    Args:
-        world: the scene.
-        name: the held object.
-        target: a space with a box to fit in.
-        out: direction out of it, horizontal unit vector [3].
-    """
-    config = world.config
-    obstacles = np.concatenate([world.others(name), world.walls])
-    obstacles = obstacles[np.linalg.norm(obstacles[:, :2] - target.xy[0], axis=1) < 2 * config.neighbours]
-    best, highest = (world.hand, world.hand_rotation), -np.inf
-    for rotation in _entering(out, config):
-        pos, room = _put_in_at(world, name, target, rotation, obstacles)
-        ways = [pos + back * out for back in (0.0, 0.05, 0.10)]
-        free = min(room, *(room_around(way, rotation, obstacles, config.gripper) for way in ways))
-        turned = np.arccos(np.clip((np.trace(rotation @ world.hand_rotation.T) - 1) / 2, -1, 1))
-        score = min(free, config.ample_room) / config.room_scale - turned / config.turn_scale
-        if score > highest:
-            best, highest = (pos, rotation), score
-    return best
-
-
-def _entering(out: np.ndarray, config: Margins) -> list[np.ndarray]:
-    """Hands that lead with their fingers against ``out``: how level they are, and the four turns about their axis."""
-    side = np.cross([0.0, 0.0, 1.0], out)
-    hands = []
-    for tilt in config.entry_tilts:
-        z = -np.sin(tilt) * out - np.cos(tilt) * np.array([0.0, 0.0, 1.0])
-        across = np.cross(z, side)
-        hands += [np.stack([np.cross(y, z), y, z], axis=1) for y in (side, -side, across, -across)]
-    return hands
-
-
-def _put_in_at(
-    world: SceneGeometry, name: str, target: Target, rotation: np.ndarray, obstacles: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Position [3] at which a hand so rotated stands the object in the middle of a space; and the room above it.
-
-    The hand may need more height than the object.
-    """
-    config = world.config
-    hung = (world.points(name) - world.hand) @ (rotation @ world.hand_rotation.T).T
-    low, high = hung.min(axis=0), hung.max(axis=0)
-    height = target.floor + config.touchdown - low[2]
-    pos = np.append(target.xy[0] - (low + high)[:2] / 2, height)
-    lifts = np.arange(0.0, max(target.roof - high[2] - height, 0.0) + 0.005, 0.01)
-    rooms = [room_around(pos + [0.0, 0.0, lift], rotation, obstacles, config.gripper) for lift in lifts]
-    enough = np.flatnonzero(np.array(rooms) > config.least_room)
-    lift = float(lifts[int(enough[0]) if len(enough) else int(np.argmax(rooms))])
-    return pos + [0.0, 0.0, lift], target.roof - (height + lift + float(high[2]))
 
 
 def _turns(world: SceneGeometry, name: str, target: Target, rotation: np.ndarray) -> list[float]:
@@ -383,7 +307,7 @@ def _put_down_at(
     near, walls = (
         around(middle, cloud, config.neighbours) for cloud in (world.others(name, *target.ignored), world.walls)
     )
-    resting = world.hand[2] + _rest(moved, near, target.floor, config)
+    resting = world.hand[2] + rest_move(moved, near, target.floor, config)
     axis = (turn @ upright(world.hand_rotation))[:, 1]
     height = _with_room(np.append(middle, resting), axis, np.concatenate([near, walls]), config)
     moved = moved + [0.0, 0.0, resting - world.hand[2]]
@@ -428,18 +352,6 @@ def _overhang(points: np.ndarray, target: Target) -> float:
     if target.half is None or target.centre is None:
         return 0.0
     return float((np.abs(points[:, :2] - target.centre) - target.half).max(initial=0.0))
-
-
-def _rest(points: np.ndarray, obstacles: np.ndarray, floor: float, config: Margins) -> float:
-    """Vertical move that brings points to rest on obstacles or on the floor, nearly touching."""
-    lift = floor - points[:, 2].min()
-    low, high = points[:, :2].min(axis=0) - config.support_radius, points[:, :2].max(axis=0) + config.support_radius
-    obstacles = obstacles[((obstacles[:, :2] > low) & (obstacles[:, :2] < high)).all(axis=1)]
-    if len(obstacles):
-        apart = np.linalg.norm(points[:, None, :2] - obstacles[None, :, :2], axis=2)
-        under = np.where(apart < config.support_radius, points[:, None, 2], np.inf).min(axis=0)
-        lift = max(lift, float((obstacles[:, 2] - under).max()))
-    return lift + config.touchdown
 
 
 def _with_room(hand: np.ndarray, axis: np.ndarray, obstacles: np.ndarray, config: Margins) -> float:

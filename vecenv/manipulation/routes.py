@@ -49,6 +49,7 @@ class RouteConfig:
         turning: in maps, room with which a hand may turn.
         touch: in maps, a hand that comes or goes along its own axis may be so far inside something: samples of surfaces
             and voxels are not exact.
+        little: in maps, a goal that is nearer than this does not give way to obstacles.
         freed: in maps, a goal that is neither grasp nor place gives way to obstacles by at most this much.
         nearer: in maps, a goal that is neither grasp nor place gives way to the arm's reach by at most this much.
         aside: in maps, a place that the arm cannot reach moves horizontally by at most this much.
@@ -75,6 +76,7 @@ class RouteConfig:
     margin: float = 0.035
     turning: float = 0.012
     touch: float = 0.006
+    little: float = 0.05
     freed: float = 0.12
     nearer: float = 0.18
     aside: float = 0.07

@@ -51,9 +51,16 @@ class Margins:
         grasp_tilts: of a hand from the vertical, tried where no upright one has room to grasp, radians.
         place_tilts: of a hand that leans away from the robot to put something down where an upright one does not reach,
             radians.
+        too_tall: what stands higher than its space by more than this is laid down in it, if it tips over easily.
+        highest_drop: for that it is let go of at most this high above its rest.
+        tipped: for that it leans this much more than where it would begin to tip over, radians.
+        spare_reach: a hand that leans to put something down keeps this far from the end of the reach, where it can.
         rim_scale: at a rim, standing out this much further is worth one point.
         tilt_scale: at a rim, and where it leans to put something down, leaning this much more costs one point, radians.
         entry_tilts: of a hand that enters a space from a side, from the vertical, radians.
+        edge_inside: the middle of what it holds is at least so far inside the space.
+        short_scale: stopping this far before the middle of the space costs one point.
+        tipping: what turns by one radian when it is let go of costs as much as stopping so far before the middle.
         least_lift: the hand rises at least this much with what it holds.
         retreat: the hand backs off this far after releasing.
     """
@@ -84,10 +91,17 @@ class Margins:
     widest_turn: float = 1.75
     overhang_scale: float = 0.005
     grasp_tilts: tuple[float, ...] = ()
-    place_tilts: tuple[float, ...] = (0.2, 0.35, 0.5)
+    place_tilts: tuple[float, ...] = (0.2, 0.35, 0.5, 0.7)
+    too_tall: float = 0.03
+    highest_drop: float = 0.08
+    tipped: float = 0.3
+    spare_reach: float = 0.04
     rim_scale: float = 0.001
     tilt_scale: float = 0.2
     entry_tilts: tuple[float, ...] = (1.4, 1.1, 0.8)
+    edge_inside: float = 0.02
+    short_scale: float = 0.1
+    tipping: float = 0.05
     least_lift: float = 0.08
     retreat: float = 0.08
 

@@ -26,14 +26,12 @@ def _grasp_point(match: Groups) -> list[str]:
 
 
 def _place_point(match: Groups) -> list[str]:
-    name, half = variable(match["thing"]), match["half"].lower().removesuffix(" side")
-    field = "corner_position" if half == "corner" else "place_position"
-    lines = [get(match["thing"]), f"x, y, z = {name}.{field}"]
-    if half not in {"left", "right"}:
-        return lines
-    way = "-" if half == "left" else "+"
-    quarter = f"({name}.aabb[1][1] - {name}.aabb[0][1]) / 4"
-    return [*lines, f"# the middle of its {half} half", f"y = y {way} {quarter}"]
+    return [get(match["thing"]), f"x, y, z = {variable(match['thing'])}.{_share(match)}_position"]
+
+
+def _share(match: Groups) -> str:
+    """How the fields of a place begin: of the whole of it, of a corner, or of one half."""
+    return match["half"].lower().removesuffix(" side") or "place"
 
 
 def _above_point(match: Groups) -> list[str]:
@@ -256,7 +254,9 @@ def _everywhere(match: Groups, expression: str, *before: str) -> list[str]:
 
 
 def _orientation(match: Groups) -> list[str]:
-    field = {"grasp": "grasp_quat", "placing": "place_quat", "pushing": "push_quat"}[match["which"].lower()]
+    share = _share(match)
+    place = "place_quat" if share == "corner" else f"{share}_quat"
+    field = {"grasp": "grasp_quat", "placing": place, "pushing": "push_quat"}[match["which"].lower()]
     return _everywhere(match, f"{variable(match['thing'])}.{field}")
 
 

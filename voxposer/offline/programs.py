@@ -11,6 +11,8 @@ from voxposer.offline.meaning import Place
 # from a side; after grasping and releasing; the way of a drawer, which stops at its end by itself; a step of a door;
 # room kept from what is to be avoided; the longest distance that fits on a table.
 ABOVE, BEFORE, LIFT, DRAWER, SHUT, DOOR, AVOID, FARTHEST = 10, 20, 10, 18, 22, 10, 15, 100
+# How far fingers sink that let go of something in a space: tipped over onto them, it would come out with them.
+SINK = 4
 # More things than this that go to one place are written as a loop, so that the program stays short.
 _LOOP = 3
 
@@ -93,7 +95,8 @@ def goal_of(place: Place, words: str, arrived: str = "") -> list[str]:
         return [f"move to {ABOVE}cm above the table {goal} {words}", f"place it {goal} {arrived}", *LEAVE]
     word = "in" if place.relation == "in" else "on"
     if words.endswith(("_inside", "_level")):
-        return [f"move to {BEFORE}cm in front of {words}", f"place it {word} {words}", *back_from(words, BEFORE)]
+        there = [f"move to {BEFORE}cm in front of {words}", f"place it {word} {words}"]
+        return [*there, f"move down by {SINK}cm", *back_from(words, BEFORE)]
     return [f"move to {ABOVE}cm above {words}", f"place it {word} {arrived}", *LEAVE]
 
 

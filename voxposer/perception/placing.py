@@ -6,6 +6,9 @@ In: the geometry of one snapshot and the options of perception. Out: a
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
 from vecenv.manipulation.placing import Target, put_down, put_in_corner
@@ -44,6 +47,28 @@ class PlaceFinder:
             return middle
         return HandPose(put_in_corner(self.scene, held, target, middle.pos, middle.rotation), middle.rotation)
 
+    def half(
+        self, points: np.ndarray, target: Target | None, held: str, middle: Callable[[], HandPose], side: float
+    ) -> HandPose:
+        """Pose of the hand that puts the held object on one half of a target, so that another has room beside it.
+
+        The half is a target of its own: what stands on the other half is beside the object, not below it.
+
+        Args:
+            points: surface of what it is put on, [N, 3].
+            target: the whole target.
+            held: the held object, "" for none.
+            middle: gives the pose for the whole target.
+            side: -1 for the left half, towards -y, 1 for the right one.
+        """
+        reach = (points.max(axis=0) - points.min(axis=0))[:2] / 2
+        aside = np.array([0.0, side * reach[1] / 2])
+        if self.config.fields == "centroid" or target is None or not held:
+            whole = middle()
+            return HandPose(whole.pos + np.append(aside, 0.0), whole.rotation)
+        xy, cost = grid_around(target.xy[0] + aside, np.maximum(reach * [1.0, 0.5] - self.config.edge, 0.0))
+        return HandPose(*put_down(self.scene, held, replace(target, xy=xy, cost=cost)))
+
     def of_object(self, name: str) -> Target | None:
         """Target for a whole object: its only space, else its only top, else the object itself."""
         snapshot = self.scene.snapshot
@@ -66,7 +91,9 @@ class PlaceFinder:
         out = exit_direction(part, self.scene) if part.kind == "space" else np.array([0.0, 0.0, 1.0])
         if out[2] > 0.5:
             floor = max(part.box.pos[2] - half[2], self.scene.ground(part.box.pos[:2]))
-            return Target(xy, cost, floor=floor, centre=part.box.pos[:2], half=half[:2])
+            # What is to be shut has to take all of what is put into it.
+            roof = np.inf if part.joint is None else float(part.box.pos[2] + half[2])
+            return Target(xy, cost, floor=floor, centre=part.box.pos[:2], half=half[:2], roof=roof)
         low, high = cavity(part, self.scene)
         middle = (low + high)[:2] / 2
         return Target(

@@ -242,14 +242,22 @@ class Perception:
         else:
             place = functools.partial(self._place_finder.pose, points, target, self.held)
         corner = functools.partial(self._place_finder.corner, target, self.held)
+        whole = functools.partial(_once, self._places, name, place)
+        half = functools.partial(self._place_finder.half, points, target, self.held, whole)
+        left = functools.partial(_once, self._places, f"left half of {name}", functools.partial(half, -1.0))
+        right = functools.partial(_once, self._places, f"right half of {name}", functools.partial(half, 1.0))
 
         later: dict[str, Callable[[], Any]] = {
             "occupancy_map": lambda: self.grid.occupancy(points).astype(float),
             "grasp_position": lambda: self._remember_voxel(_once(self._grasps, name, grasp), name),
             "grasp_quat": lambda: quaternion(_once(self._grasps, name, grasp).rotation),
-            "place_position": lambda: self._remember_voxel(_once(self._places, name, place)),
-            "place_quat": lambda: quaternion(_once(self._places, name, place).rotation),
-            "corner_position": lambda: self._remember_voxel(corner(_once(self._places, name, place))),
+            "place_position": lambda: self._remember_voxel(whole()),
+            "place_quat": lambda: quaternion(whole().rotation),
+            "corner_position": lambda: self._remember_voxel(corner(whole())),
+            "left_position": lambda: self._remember_voxel(left()),
+            "left_quat": lambda: quaternion(left().rotation),
+            "right_position": lambda: self._remember_voxel(right()),
+            "right_quat": lambda: quaternion(right().rotation),
         }
         return LazyObservation(values, later)
 
