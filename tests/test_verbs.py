@@ -278,5 +278,5 @@ def test_calls_in_any_order_keep_the_rules(verbs: type[Verbs]) -> None:
 @pytest.mark.heavy
 def test_a_hundred_thousand_calls_keep_the_rules(verbs: type[Verbs]) -> None:
     verbs.calls = 0
-    run(verbs, 1050, 100)
+    run(verbs, 1150, 100)
     assert verbs.calls >= 100_000

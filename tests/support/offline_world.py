@@ -210,6 +210,7 @@ class ToyWorld:
         if part.kind == "knob":
             return opened + self.turned.get(name, 0.0) > 0.5 * part.joint.travel
         return self._drawn("open", f"{_stem(name)}_region")
+
     def _aside(self, name: str, side: float) -> np.ndarray:
         """From the middle of a thing to the middle of its left half (-1) or of its right one (1)."""
         low, high = self.bounds(name)
