@@ -4,7 +4,7 @@ Two parts, each for half of the time. ``evaluation``: one evaluation after the o
 own, slots that are filled again when their episode ends, and a camera image of every slot read at every tick. Each is
 interrupted on the way, as by Ctrl-C, and resumed from its folder.
 ``batch``: one environment whose episodes run to their budget, started again and again, with random actions. A row is
-what the process holds at one moment; the last lines compare the end of each part with its first third.
+what the process holds at one moment; the last lines have the most that it held in each third of a part.
 
     python benchmarks/soak.py --minutes 60
 """
@@ -31,6 +31,7 @@ from vecenv.contract import BatchEnv
 
 MIB = 2**20
 SUITE = "libero_object"
+HELD = ("rss_mib", "handles", "threads")
 
 
 class LookingPolicy(RandomPolicy):
@@ -137,13 +138,12 @@ def batch(meter: Meter, until: float, *, slots: int, budget: int) -> None:
             meter.episodes += int(env.done.sum())
 
 
-def growth(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """By part: how much more there is of everything at the end than after the first third."""
+def peaks(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """By part: the most that there was of everything in each third of its time."""
     found: dict[str, Any] = {}
     for part in dict.fromkeys(row["part"] for row in rows):
-        own = [row for row in rows if row["part"] == part]
-        first = own[len(own) // 3]
-        found[part] = {name: round(own[-1][name] - first[name], 1) for name in ("rss_mib", "handles", "threads")}
+        thirds = np.array_split([row for row in rows if row["part"] == part], 3)
+        found[part] = {name: [max(row[name] for row in third) for third in thirds] for name in HELD}
     return found
 
 
@@ -174,10 +174,10 @@ def main() -> None:
         meter.part = "batch"
         batch(meter, time.monotonic() + half, slots=given.slots, budget=given.ticks)
         meter.note()
-    notes = {"growth": growth(meter.rows)}
+    notes = {"peaks": peaks(meter.rows)}
     report("soak", meter.rows, title="What a process holds over time", notes=notes)
-    for part, more in notes["growth"].items():
-        print(f"{part}: since its first third " + ", ".join(f"{name} {value:+}" for name, value in more.items()))
+    for part, most in notes["peaks"].items():
+        print(f"{part}: most in each third: " + ", ".join(f"{name} {values}" for name, values in most.items()))
 
 
 if __name__ == "__main__":
