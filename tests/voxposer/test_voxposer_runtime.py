@@ -15,6 +15,7 @@ from test_voxposer_agent import CUBE, REPLIES, Scripted, agent
 import vecenv
 from vecenv.contract import BatchEnv
 from vecenv.errors import InvalidInput
+from vecenv.manipulation import reach, rooms
 from vecenv.observations import ObjectsSnapshot
 from voxposer.agent import Agent, AgentConfig
 from voxposer.episode import SUBTASK_BUDGET, SUCCESS
@@ -82,6 +83,14 @@ def test_a_released_episode_frees_its_snapshot() -> None:
     table.release(handles)
     gc.collect()
     assert there() is None
+
+
+def test_the_time_of_programs_is_not_spent_on_compiling() -> None:
+    kernels = (reach._kernel, reach._forward_kernel, rooms._kernel)
+    for kernel in kernels:
+        kernel.cache_clear()
+    runtimes()
+    assert all(kernel.cache_info().currsize for kernel in kernels)
 
 
 # -- subtasks ----------------------------------------------------------------------------------------------------------

@@ -84,6 +84,15 @@ def hand_of(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pose[0].copy(), pose[1:].T.copy()
 
 
+def compile_kernels() -> None:
+    """Compile what this module computes with, seconds once a machine, before anything that has little time asks for it.
+
+    Afterwards it is read from a cache.
+    """
+    _kernel()
+    _forward_kernel()
+
+
 def _seeds(position: np.ndarray) -> np.ndarray:
     seeds = np.tile(_HOME, (len(_WRISTS), 1))
     seeds[:, 0] = np.arctan2(position[1], position[0])

@@ -184,6 +184,11 @@ def dense_surface(cloud: PointCloud, pitch: float = 0.011) -> np.ndarray:
     return np.concatenate(filled)
 
 
+def compile_kernels() -> None:
+    """As of ``vecenv.manipulation.reach``."""
+    _kernel()
+
+
 def _thinned(points: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """The highest point of each cell of some extents [3]."""
     if not len(points):
