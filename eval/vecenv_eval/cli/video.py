@@ -11,10 +11,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -22,9 +22,9 @@ from vecenv.cli import fail
 from vecenv.util.names import unknown
 from vecenv_eval.cli.options import some_settings, user_errors, with_settings
 from vecenv_eval.config import ConfigError, EvalConfig, option_name
-from vecenv_eval.video.film import Film
-from vecenv_eval.video.grid import GAP
-from vecenv_eval.video.writer import check_suffix
+
+if TYPE_CHECKING:
+    from vecenv_eval.video.film import Film
 
 # Step budget of LIBERO's videos, control ticks.
 _MAX_STEPS = 400
@@ -66,7 +66,9 @@ def video_command(
     hold: float = typer.Option(0.0, min=0.0, help="Seconds that the last frame stays."),
     columns: int | None = typer.Option(None, min=1, help="Episodes in a row.", show_default="as many as rows"),
     titles: bool = typer.Option(True, help="Write episode and instruction above each image."),
-    border: int = typer.Option(GAP, min=0, help="Width of the frame in the colour of the verdict, pixels."),
+    border: int | None = typer.Option(
+        None, min=0, help="Width of the frame in the colour of the verdict, pixels.", show_default="2"
+    ),
     config: Path | None = typer.Option(
         None, help="YAML file of settings, by the names of EvalConfig's fields; options override it."
     ),
@@ -77,9 +79,14 @@ def video_command(
     sys.path.append(str(Path.cwd()))  # so that --policy module:Class finds a module beside the user
     with user_errors():
         given = some_settings(settings, config, SETTINGS, "video")
+        from vecenv_eval.video.film import Film
+        from vecenv_eval.video.writer import check_suffix
+
         check_suffix(out, "--out")
         _check_place(out)
-        film = Film(every=every, fps=fps, columns=columns, titles=titles, border=border, hold=hold)
+        film = Film(every=every, fps=fps, columns=columns, titles=titles, hold=hold)
+        if border is not None:
+            film = replace(film, border=border)
         if results:
             _show(results, given, out, film)
         else:
@@ -144,8 +151,6 @@ def _known(suites: Sequence[str]) -> Sequence[str]:
 
 def _with_budget(config: EvalConfig, protocol_given: bool) -> EvalConfig:
     """The config with the step budget of a video, where neither it nor a protocol says another."""
-    from dataclasses import replace
-
     import vecenv
 
     if len(config.suites) != 1:
